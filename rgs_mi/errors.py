@@ -1,0 +1,19 @@
+"""The one exception that reaches a person: a single line that names the file and the remedy."""
+
+import sys
+
+
+class UserError(Exception):
+    """Bad input. The message is one line: what is wrong, in which file, and what to do about it."""
+
+
+def run_main(main):
+    """Call ``main()`` as a command: a ``UserError`` prints one line and exits with 2, Ctrl-C with 130."""
+    try:
+        sys.exit(main())
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(130)

@@ -1,0 +1,1 @@
+"""Procedural objects and light for the truth scenes in scenes/targets."""

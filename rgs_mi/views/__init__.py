@@ -1,0 +1,42 @@
+"""Photographs and their cameras: a folder in, lists of `View` out."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..camera import Camera
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph.
+
+    Attributes
+      name:   file stem, unique within its split
+      camera: its pinhole camera
+      pixels: [H, W, 4] RGBA with straight (not premultiplied) alpha. uint8: sRGB-encoded; float32: linear radiance (HDR).
+              Alpha is 255 or 1 everywhere when the photograph has none.
+      masked: whether the photograph came with an alpha channel or mask
+      normal: [H, W, 3] float32 unit normals in world space (0 where there is none), or None
+      path:   the image file
+    """
+
+    name: str
+    camera: Camera
+    pixels: np.ndarray
+    masked: bool
+    normal: np.ndarray | None
+    path: Path
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A capture. ``train`` is fitted, ``test`` is held out (and only ever looked at); ``points`` are [N, 3] positions and
+    ``point_colors`` [N, 3] linear colours of a sparse reconstruction where the layout has one."""
+
+    train: list[View]
+    test: list[View]
+    points: np.ndarray | None = None
+    point_colors: np.ndarray | None = None
+    root: Path = field(default_factory=Path)
