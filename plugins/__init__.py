@@ -6,7 +6,7 @@ import sys
 
 import mitsuba as mi
 
-_MODULES = ()
+_MODULES = ("procedural",)
 
 
 def _load(_old, new):

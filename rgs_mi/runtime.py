@@ -74,6 +74,7 @@ def set_variant(name: str = "llvm_ad_rgb"):
             raise UserError(f"{_VARIABLE}={path} is not an LLVM library: {_REMEDY}")
         if version < MIN_LLVM:
             raise UserError(f"{path} is LLVM {version}, which is too old (need {MIN_LLVM}): {_REMEDY}")
+    import drjit as dr
     import mitsuba as mi
 
     if mi.variant() == name:
@@ -82,3 +83,6 @@ def set_variant(name: str = "llvm_ad_rgb"):
         mi.set_variant(name)
     except (ImportError, RuntimeError) as error:
         raise UserError(f"variant '{name}' does not run on this machine: {str(error).splitlines()[0]}") from error
+    if name.startswith("llvm") and dr.detail.llvm_version()[0] < MIN_LLVM:
+        raise UserError(f"Dr.Jit had loaded LLVM {dr.detail.llvm_version()[0]} before rgs_mi could choose one: "
+                        "import rgs_mi before drjit and mitsuba")

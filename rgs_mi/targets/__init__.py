@@ -1,1 +1,28 @@
-"""Procedural objects and light for the truth scenes in scenes/targets."""
+"""Objects and environments of our own, made by code: what the path-traced data sets show.
+
+A model is a module of this package with `PARTS`, a dict from a part's name to a function that returns its
+`meshes.Mesh`; it is listed in `MODELS` below. Environments are listed in `environments.ENVIRONMENTS`.
+Models are centred at the origin, z up, front towards +x, within a radius of about 1. Needs NumPy only.
+"""
+
+import functools
+import importlib
+
+from ..errors import UserError
+
+MODELS = ("helmet",)
+
+
+def pick(table: dict, name: str, what: str):
+    """``table[name]``. Raises: UserError that lists the known names."""
+    if name not in table:
+        raise UserError(f"unknown {what} '{name}': known are {', '.join(sorted(table))}")
+    return table[name]
+
+
+@functools.cache
+def mesh(model: str, part: str):
+    """The `meshes.Mesh` of one part of a model. Raises: UserError for an unknown model or part."""
+    pick(dict.fromkeys(MODELS), model, "model")
+    parts = importlib.import_module(f"{__name__}.{model}").PARTS
+    return pick(parts, part, f"part of the model '{model}'")()

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from ..camera import Camera
+from ..errors import UserError
 
 
 @dataclass(frozen=True)
@@ -15,8 +16,8 @@ class View:
     Attributes
       name:   file stem, unique within its split
       camera: its pinhole camera
-      pixels: [H, W, 4] RGBA with straight (not premultiplied) alpha. uint8: sRGB-encoded; float32: linear radiance (HDR).
-              Alpha is 255 or 1 everywhere when the photograph has none.
+      pixels: [H, W, 4] RGBA with straight (not premultiplied) alpha. uint8: sRGB-encoded; float32: linear radiance
+              (HDR). Alpha is 255 or 1 everywhere when the photograph has none.
       masked: whether the photograph came with an alpha channel or mask
       normal: [H, W, 3] float32 unit normals in world space (0 where there is none), or None
       path:   the image file
@@ -32,11 +33,26 @@ class View:
 
 @dataclass(frozen=True)
 class Dataset:
-    """A capture. ``train`` is fitted, ``test`` is held out (and only ever looked at); ``points`` are [N, 3] positions and
-    ``point_colors`` [N, 3] linear colours of a sparse reconstruction where the layout has one."""
+    """A capture. ``train`` is fitted, ``test`` is held out (and only ever looked at); ``points`` are [N, 3] positions
+    and ``point_colors`` [N, 3] linear colours of a sparse reconstruction where the layout has one."""
 
     train: list[View]
     test: list[View]
     points: np.ndarray | None = None
     point_colors: np.ndarray | None = None
     root: Path = field(default_factory=Path)
+
+
+def load_dataset(root: Path) -> Dataset:
+    """Load the capture in folder ``root``, whatever known layout it has.
+
+    Raises: UserError when the folder is missing, has no known layout, or when a file in it is bad.
+    """
+    from . import blender
+
+    root = Path(root)
+    if not root.is_dir():
+        raise UserError(f"data folder '{root}' does not exist: give a capture's folder with --data")
+    if (root / blender.TRAIN).is_file():
+        return blender.load(root)
+    raise UserError(f"data folder '{root}' has no layout that is known: looked for {blender.TRAIN} (Blender)")

@@ -1,0 +1,277 @@
+"""The visual hull of alpha masks: cameras and silhouettes in, a closed surface and depth maps out.
+
+A view's mask becomes a signed distance on the image plane; times depth over focal length it is, to first order, the
+distance in the world from the silhouette's cone. The hull's field is the least of these over the views, sampled
+bilinearly, so the surface lies between grid nodes and is not stair-stepped. Needs no network, and reflections can't
+mislead it; concavities that no silhouette shows stay filled.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage, spatial, special
+
+from ..errors import UserError
+
+_EDGE_SIGMA = 0.6  # pixels; small enough that lines one pixel wide stay above one half
+_PIXEL_VARIANCE = 1 / 12  # of the box that an antialiased mask has been averaged over
+
+
+@dataclass(frozen=True)
+class SignedField:
+    """A signed distance on a grid: positive inside, truncated at a few steps.
+
+    Attributes
+      values: [X, Y, Z] float32 in world units
+      lower:  [3] world position of node (0, 0, 0)
+      step:   distance of neighbouring nodes in world units
+    """
+
+    values: np.ndarray
+    lower: np.ndarray
+    step: float
+
+
+# ---- Silhouettes ----
+
+@dataclass(frozen=True)
+class _Silhouette:
+    """One view's mask as a signed distance in pixels ([H, W] float32, positive inside), and its camera."""
+
+    distance: np.ndarray
+    camera: object
+
+    def sample(self, points: np.ndarray) -> np.ndarray:
+        """World-space signed distance [N] from the silhouette's cone at ``points`` [N, 3]; NaN outside the frame."""
+        camera, (height, width) = self.camera, self.distance.shape
+        p = points @ camera.rotation.T.astype(np.float32) - (camera.rotation @ camera.origin).astype(np.float32)
+        z = np.maximum(p[:, 2], np.float32(1e-6))
+        x = p[:, 0] / z * np.float32(camera.focal[0]) + np.float32(camera.principal[0] - 0.5)
+        y = p[:, 1] / z * np.float32(camera.focal[1]) + np.float32(camera.principal[1] - 0.5)
+        seen = (p[:, 2] > 1e-6) & (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
+        x, y = np.where(seen, x, 0), np.where(seen, y, 0)
+        i, j = np.minimum(x.astype(np.int32), width - 2), np.minimum(y.astype(np.int32), height - 2)
+        x, y, k, d = x - i, y - j, j * width + i, self.distance.ravel()
+        upper = d.take(k) * (1 - x) + d.take(k + 1) * x
+        lower = d.take(k + width) * (1 - x) + d.take(k + (width + 1)) * x
+        value = (upper * (1 - y) + lower * y) * z * np.float32(1 / np.mean(camera.focal))
+        return np.where(seen, value, np.float32(np.nan))
+
+
+def _signed_distance(alpha: np.ndarray) -> np.ndarray:
+    """[H, W] signed distance in pixels to the alpha = 1/2 contour of an antialiased mask with values in [0, 1].
+
+    Far from the contour the Euclidean distance transform; near it the offset of the straight edge that would give the
+    blurred mask its value, which is accurate to a small part of a pixel.
+    """
+    blurred = ndimage.gaussian_filter(alpha, _EDGE_SIGMA, truncate=4)
+    inside = blurred > 0.5
+    rim = inside & ~ndimage.binary_erosion(inside, border_value=1)
+    distance = ndimage.distance_transform_edt(~rim).astype(np.float32)
+    distance = np.where(inside, distance + np.float32(0.5), np.float32(0.5) - distance)
+    near = np.abs(distance) < 1.2
+    offset = special.erfinv(np.clip(2 * blurred[near] - 1, -0.98, 0.98))
+    distance[near] = np.sqrt(2 * (_EDGE_SIGMA**2 + _PIXEL_VARIANCE)) * offset
+    return distance
+
+
+def _silhouettes(views) -> list[_Silhouette]:
+    """The silhouettes of all masked views. Raises: UserError when fewer than two have a usable mask."""
+    def one(view):
+        scale = np.float32(255) if view.pixels.dtype == np.uint8 else np.float32(1)
+        alpha = view.pixels[..., 3] / scale
+        blank = (alpha > 0.5).all() or not (alpha > 0.5).any() or min(alpha.shape) < 2
+        return None if blank else _Silhouette(_signed_distance(alpha), view.camera)
+
+    with ThreadPoolExecutor() as pool:
+        found = [s for s in pool.map(one, [v for v in views if v.masked]) if s is not None]
+    if len(found) < 2:
+        raise UserError("a visual hull needs alpha masks in two views or more, and these photographs have none: "
+                        "give images with alpha, or a sparse point cloud (COLMAP, PLY), or start from random points")
+    return found
+
+
+def _carve(silhouettes, points: np.ndarray, truncation: float) -> np.ndarray:
+    """The field [N] at ``points`` [N, 3], clipped to ± ``truncation``.
+
+    Points drop out as soon as a view puts them further outside than the truncation. Points that fewer than a
+    quarter of the views see are outside, too.
+    """
+    def chunk(points):
+        value = np.full(len(points), truncation, np.float32)
+        count = np.zeros(len(points), np.int32)
+        alive = np.arange(len(points))
+        for silhouette in silhouettes:
+            sample = silhouette.sample(points[alive])
+            count[alive] += ~np.isnan(sample)
+            value[alive] = sample = np.fmin(value[alive], sample)
+            alive = alive[sample > -truncation]
+        value[alive[count[alive] < len(silhouettes) / 4]] = -truncation
+        return np.maximum(value, -truncation)
+
+    # Neighbouring views are alike: a stride that visits them far apart lets points drop out early.
+    order = np.argsort((np.arange(len(silhouettes)) * 0.618034) % 1, kind="stable")
+    silhouettes = [silhouettes[i] for i in order]
+    with ThreadPoolExecutor() as pool:
+        parts = np.array_split(points, max(1, len(points) // 65536))
+        return np.concatenate(list(pool.map(chunk, parts)))
+
+
+# ---- The field ----
+
+def looked_at(cameras) -> tuple[np.ndarray, float]:
+    """The point [3] nearest to all optical axes, and the greatest distance of a camera from it (at least 1e-3)."""
+    origins = np.stack([c.origin for c in cameras])
+    axes = np.stack([c.to_world[:3, 2] for c in cameras])
+    away = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [C, 3, 3] projects onto the plane across each axis
+    # Where all axes are parallel the depth is free: the faint pull keeps it near the cameras.
+    pull = 1e-6 * len(cameras) * np.eye(3)
+    centre = np.linalg.solve(away.sum(0) + pull, (away @ origins[:, :, None]).sum((0, 2)) + pull @ origins.mean(0))
+    return centre, max(float(np.linalg.norm(origins - centre, axis=1).max()), 1e-3)
+
+
+def _grid(lower, upper, step) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Nodes [N, 3] float32 of the smallest grid from ``lower`` on that covers the box, and its shape."""
+    shape = tuple(int(np.ceil(d / step)) + 1 for d in upper - lower)
+    axes = [lower[k] + step * np.arange(shape[k]) for k in range(3)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3).astype(np.float32), shape
+
+
+def object_box(views) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner [3] of the masked object, from cameras and masks alone, with a small margin.
+
+    Starts from the cube around the point that the cameras look at which reaches as far as the cameras do, carves it
+    coarsely and shrinks it to what is left, until that changes little. Raises: UserError without masks, or when the
+    silhouettes have no common volume.
+    """
+    return _object_box(_silhouettes(views))
+
+
+def _object_box(silhouettes):
+    centre, reach = looked_at([s.camera for s in silhouettes])
+    lower, upper = centre - reach, centre + reach
+    for _ in range(8):
+        step = (upper - lower).max() / 40
+        points, _ = _grid(lower, upper, step)
+        # A cell counts while any part of it may be inside: its corners are at most 0.87 steps away.
+        left = points[_carve(silhouettes, points, 2 * step) > -0.87 * step]
+        if not len(left):
+            raise UserError("the silhouettes of the views have no common volume: check that the cameras belong to the "
+                            "images and follow the layout's convention")
+        before = (upper - lower).max()
+        lower, upper = np.maximum(left.min(0) - step, lower), np.minimum(left.max(0) + step, upper)
+        if (upper - lower).max() > 0.9 * before:
+            break
+    return lower, upper
+
+
+def carve(views, box, resolution: int = 160) -> SignedField:
+    """The visual hull of all masked views on a grid with ``resolution`` steps along the longest side of ``box``.
+
+    ``box`` is (lower [3], upper [3]) as from `object_box`. Where a point is outside a view's frame that view does not
+    decide. Raises: UserError without masks, or when nothing is left.
+    """
+    return _field(_silhouettes(views), box, resolution)
+
+
+def visual_hull(views, resolution: int = 160) -> SignedField:
+    """`carve` inside `object_box`, measuring the silhouettes once."""
+    silhouettes = _silhouettes(views)
+    return _field(silhouettes, _object_box(silhouettes), resolution)
+
+
+def _field(silhouettes, box, resolution):
+    lower, upper = (np.asarray(corner, np.float64) for corner in box)
+    step = float((upper - lower).max() / resolution)
+    lower = lower - 2 * step  # the surface closes inside the grid
+    coarse, shape = _grid(lower, upper + 2 * step, 4 * step)
+    coarse = _carve(silhouettes, coarse, 8 * step).reshape(shape)
+    points, shape = _grid(lower, upper + 2 * step, step)
+    # A distance changes by no more than the way gone, here at most 3.5 steps to the nearest coarse node: only where the
+    # coarse field is smaller than that (and a margin) can the surface be.
+    nodes = np.stack(np.unravel_index(np.arange(len(points)), shape)) / np.float32(4)
+    values = ndimage.map_coordinates(coarse, nodes, order=1, mode="nearest")
+    band = np.abs(values) < 4.5 * step
+    values[band] = _carve(silhouettes, points[band], 3 * step)
+    values = np.clip(values, -3 * step, 3 * step).reshape(shape)
+    values = ndimage.gaussian_filter(values, 0.6)
+    for axis in range(3):
+        np.moveaxis(values, axis, 0)[[0, -1]] = -step
+    if values.max() <= 0:
+        raise UserError("the visual hull is empty: check that the cameras belong to the images, or carve it finer")
+    return SignedField(values, lower, step)
+
+
+# ---- The surface ----
+
+def surface(field: SignedField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The zero level: vertices [V, 3] (world), faces [F, 3] int32 (counter-clockwise from outside), outward unit
+    normals [V, 3]."""
+    from skimage.measure import marching_cubes
+
+    nodes, faces, _, _ = marching_cubes(field.values, 0.0, gradient_direction="ascent")
+    # Min has creases where cones meet, and marching cubes slivers: a gradient over a few steps is a steadier normal.
+    smooth = ndimage.gaussian_filter(field.values, 1.0)
+    gradient = [ndimage.map_coordinates(g, nodes.T, order=1) for g in np.gradient(smooth)]
+    normals = -np.stack(gradient, -1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    vertices = (field.lower + field.step * nodes).astype(np.float32)
+    return vertices, faces.astype(np.int32), normals.astype(np.float32)
+
+
+def sample_surface(vertices, faces, normals, count: int, rng) -> tuple[np.ndarray, np.ndarray]:
+    """``count`` points on a mesh, spread evenly: positions [count, 3] and unit normals [count, 3], float32.
+
+    Six times as many area-weighted samples are thinned to a Poisson-disk set, in rounds: a sample stays when no
+    remaining neighbour comes before it in a random order. Too many are cut and too few topped up at random.
+    """
+    corners = vertices[faces].astype(np.float64)
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    face = rng.choice(len(faces), 6 * count, p=area / area.sum())
+    u, v = np.sqrt(rng.random(6 * count)), rng.random(6 * count)
+    weights = np.stack([1 - u, u * (1 - v), u * v], -1)[:, :, None]
+    positions = (weights * corners[face]).sum(1)
+
+    radius = 0.69 * np.sqrt(area.sum() / count)
+    a, b = spatial.cKDTree(positions).query_pairs(radius, output_type="ndarray").T  # a < b: the index is the order
+    state = np.zeros(6 * count, np.int8)  # 0 open, 1 kept, -1 removed
+    while (state == 0).any():
+        held = np.zeros(6 * count, bool)
+        held[b] = True
+        state[(state == 0) & ~held] = 1
+        state[b[state[a] == 1]] = -1
+        open_ = (state[a] == 0) & (state[b] == 0)
+        a, b = a[open_], b[open_]
+    kept, rest = np.flatnonzero(state == 1), np.flatnonzero(state != 1)
+    chosen = np.concatenate([rng.permutation(kept), rng.permutation(rest)])[:count]
+
+    normal = (weights[chosen] * normals[faces[face[chosen]]]).sum(1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return positions[chosen].astype(np.float32), normal.astype(np.float32)
+
+
+def depth_maps(vertices, faces, cameras) -> list[np.ndarray]:
+    """The mesh seen by each camera: a list of [H, W] float32 z-depths, NaN where it is missed. Needs a JIT variant."""
+    import drjit as dr
+    import mitsuba as mi
+
+    mesh = mi.Mesh("hull", len(vertices), len(faces))
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = np.ascontiguousarray(vertices, np.float32).ravel()
+    params["faces"] = np.ascontiguousarray(faces, np.uint32).ravel()
+    params.update()
+    scene = mi.load_dict({"type": "scene", "hull": mesh})
+    depths = []
+    for camera in cameras:
+        width, height = camera.size
+        # Opaque, or every pose would be compiled into a kernel of its own.
+        number = lambda x: dr.opaque(mi.Float, float(x))
+        pixel = dr.arange(mi.UInt32, width * height)
+        x = (mi.Float(pixel % width) + 0.5 - number(camera.principal[0])) / number(camera.focal[0])
+        y = (mi.Float(pixel // width) + 0.5 - number(camera.principal[1])) / number(camera.focal[1])
+        right, down, forward, origin = (mi.Vector3f(*map(number, camera.to_world[:3, k])) for k in range(4))
+        ray = mi.Ray3f(mi.Point3f(origin), right * x + down * y + forward)  # unit z: the ray parameter is the depth
+        t = np.array(scene.ray_intersect_preliminary(ray, coherent=True).t).reshape(height, width)
+        depths.append(np.where(np.isfinite(t), t, np.float32(np.nan)))
+    return depths

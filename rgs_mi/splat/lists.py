@@ -1,0 +1,141 @@
+"""Tile lists: which surfels touch which tile, front to back.
+
+The bounds are exact. A surfel's weight exceeds the cut-off where u² + v² ≤ r² with r² = 2 ln(opacity / cut-off), which by
+(1) of `project.py` is an ellipse on the screen, or inside the disk of the low-pass. Each row of tiles is intersected with
+both, so no tile is listed that the surfel cannot reach, whatever its shape, tilt or opacity.
+"""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from .tiles import LOW_PASS, TILE, tile_grid
+
+FAR = 1e6  # pixels: beyond every image
+
+
+@dataclass
+class TileLists:
+    """``ids``: surfel numbers, grouped by tile, front to back inside a tile; ``first`` and ``count``: each tile's range of
+    ``ids``; ``seen``: one flag a surfel, whether any tile lists it."""
+
+    ids: "mi.UInt32"
+    first: "mi.UInt32"
+    count: "mi.UInt32"
+    seen: "mi.Bool"
+
+
+@dataclass
+class _Outline:
+    """Where a surfel's weight can exceed the cut-off: an ellipse about (ex, ey) with inverse shape matrix (i00, i01; ., i11)
+    and level k, half extents (hx, hy), and a disk of radius r about (x, y). Pixels."""
+
+    ex: "mi.Float"
+    ey: "mi.Float"
+    hx: "mi.Float"
+    hy: "mi.Float"
+    i00: "mi.Float"
+    i01: "mi.Float"
+    i11: "mi.Float"
+    k: "mi.Float"
+    x: "mi.Float"
+    y: "mi.Float"
+    r: "mi.Float"
+
+    def columns(self):
+        return [getattr(self, name) for name in self.__dataclass_fields__]
+
+    def span(self, low, high):
+        """Least and greatest x that the outline reaches with y in [low, high]."""
+        slope = self.i01 / self.i11
+        half = dr.sqrt(dr.maximum(self.i00 - self.i01 * slope, 0))
+        y_max = self.i01 * dr.sqrt(self.k / self.i00)  # the rightmost point lies that far below the centre
+        right, left = (dr.clip(dr.clip(self.ey + s, low, high) - self.ey, -self.hy, self.hy) for s in (y_max, -y_max))
+        chord = lambda y: half * dr.sqrt(dr.maximum(self.k - y * y / self.i11, 0))
+        x_max, x_min = self.ex + slope * right + chord(right), self.ex + slope * left - chord(left)
+        y_disk = dr.clip(self.y, low, high) - self.y
+        in_disk = dr.abs(y_disk) < self.r
+        chord_disk = dr.sqrt(dr.maximum(self.r * self.r - y_disk * y_disk, 0))
+        return (dr.select(in_disk, dr.minimum(x_min, self.x - chord_disk), x_min),
+                dr.select(in_disk, dr.maximum(x_max, self.x + chord_disk), x_max))
+
+
+def _outline(geometry, alpha_min):
+    """The outline of every surfel, and whether it has one. A plane that reaches behind the camera inside its r has no
+    ellipse but an unbounded conic: such a surfel (rare: the camera is almost inside it) is listed everywhere."""
+    x, y, A_x, A_y, B_x, B_y, N_x, N_y, _, opacity = geometry
+    r2 = 2 * dr.log(dr.maximum(opacity / alpha_min, 1))
+    # (A·δ)² + (B·δ)² = r² (1 + N·δ)², written as (δ−e)ᵀ Q (δ−e) = k
+    q00, q11 = A_x * A_x + B_x * B_x - r2 * N_x * N_x, A_y * A_y + B_y * B_y - r2 * N_y * N_y
+    q01 = A_x * A_y + B_x * B_y - r2 * N_x * N_y
+    det = q00 * q11 - q01 * q01
+    i00, i01, i11 = q11 / det, -q01 / det, q00 / det
+    e_x, e_y = r2 * (i00 * N_x + i01 * N_y), r2 * (i01 * N_x + i11 * N_y)
+    k = r2 * (1 + N_x * e_x + N_y * e_y)
+    bounded = (det > 0) & (q00 > 0) & dr.isfinite(k)
+    ellipse = lambda value, everywhere: dr.select(bounded, value, everywhere)
+    e_x, e_y, i01 = (ellipse(v, 0) for v in (e_x, e_y, i01))
+    i00, i11, k = ellipse(i00, 1), ellipse(i11, 1), ellipse(k, FAR * FAR)
+    return _Outline(x + e_x, y + e_y, dr.sqrt(k * i00), dr.sqrt(k * i11), i00, i01, i11, k, x, y,
+                    dr.sqrt(r2 / LOW_PASS)), r2 > 0
+
+
+def tile_lists(projected, size, alpha_min) -> TileLists:
+    """List the surfels of every tile of an image of ``size`` (width, height) pixels."""
+    with dr.suspend_grad():
+        columns, rows = tile_grid(size)
+        outline, drawn = _outline(projected.geometry, alpha_min)
+        drawn &= projected.visible
+        # A pixel belongs to the surfel when its centre does: tile row r holds the centres TILE[1] r + 1/2 …
+        index = lambda v, n, t: mi.Int32(dr.clip(dr.floor((v - 0.5) / t), -1, n))
+        top = dr.maximum(index(dr.minimum(outline.ey - outline.hy, outline.y - outline.r), rows, TILE[1]), 0)
+        bottom = dr.minimum(index(dr.maximum(outline.ey + outline.hy, outline.y + outline.r), rows, TILE[1]) + 1, rows)
+        drawn &= top < bottom
+        bottom = dr.select(drawn, bottom, top)
+
+        order = dr.argsort(dr.select(drawn, projected.geometry[8], dr.inf))
+        outline = _Outline(*[dr.gather(mi.Float, v, order) for v in outline.columns()])
+        top, bottom = dr.gather(mi.Int32, top, order), dr.gather(mi.Int32, bottom, order)
+        dr.eval(order, outline.columns(), top, bottom)
+
+        def span(row):
+            """First and one-past-last tile column of a tile row."""
+            low = mi.Float(row * TILE[1]) + 0.5
+            x_min, x_max = outline.span(low, low + (TILE[1] - 1))
+            first = mi.UInt32(dr.clip(dr.ceil((x_min - (TILE[0] - 0.5)) / TILE[0]), 0, columns))
+            last = mi.UInt32(dr.clip(dr.floor((x_max - 0.5) / TILE[0]) + 1, 0, columns))
+            return first, dr.maximum(last, first)
+
+        def count(row, n):
+            first, last = span(row)
+            return row + 1, n + (last - first)
+
+        _, entries = dr.while_loop((mi.Int32(top), mi.UInt32(0)), lambda row, n: row < bottom, count)
+        offset = dr.prefix_reduce(dr.ReduceOp.Add, entries, exclusive=True)
+        total = int(offset[-1] + entries[-1]) if len(entries) else 0
+        n_tiles = columns * rows
+        seen = dr.zeros(mi.Bool, dr.width(order))
+        if total == 0:
+            return TileLists(dr.zeros(mi.UInt32, 1), dr.zeros(mi.UInt32, n_tiles), dr.zeros(mi.UInt32, n_tiles), seen)
+        tile, surfel = dr.empty(mi.UInt32, total), dr.empty(mi.UInt32, total)
+
+        def place(row, at):
+            first, last = span(row)
+
+            def put(column, at):
+                dr.scatter(tile, mi.UInt32(row) * columns + column, at)
+                dr.scatter(surfel, order, at)
+                return column + 1, at + 1
+
+            _, at = dr.while_loop((first, at), lambda column, at: column < last, put)
+            return row + 1, at
+
+        dr.eval(dr.while_loop((mi.Int32(top), mi.UInt32(offset)), lambda row, at: row < bottom, place))
+        dr.scatter(seen, entries > 0, order)
+        length = dr.zeros(mi.UInt32, n_tiles)
+        dr.scatter_reduce(dr.ReduceOp.Add, length, mi.UInt32(1), tile)
+        first = dr.prefix_reduce(dr.ReduceOp.Add, length, exclusive=True)
+        ids = dr.gather(mi.UInt32, surfel, dr.argsort(tile))  # stable: depth order survives inside a tile
+        dr.eval(ids, first, length, seen)
+        return TileLists(ids, first, length, seen)

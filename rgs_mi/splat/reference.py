@@ -1,0 +1,63 @@
+"""The splatter's slow, readable twin: every surfel against every pixel. The oracle of the tests.
+
+It shares no formula with the tiled one: rays are intersected with planes in world space, nothing is projected but the
+centre, no lists are formed, and Dr.Jit differentiates it. For scenes of some hundred surfels: all pairs are in memory.
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .gbuffer import GBuffer
+from .project import NEAR
+from .tiles import LOW_PASS, Cutoffs
+
+
+def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> GBuffer:
+    """The same maps as `render_gbuffer`, in the same frames and units, without `seen`."""
+    width, height = camera.size
+    origin = mi.Point3f(camera.origin)
+    x_axis, y_axis, z_axis = (mi.Vector3f(row) for row in camera.rotation)
+
+    centers = surfels.column(mi.Point3f, "centers")
+    depth = dr.dot(centers - origin, z_axis)
+    order = np.argsort(depth.numpy(), kind="stable")
+    order = order[depth.numpy()[order] > NEAR].astype(np.uint32)
+    n = len(order)
+    pair = dr.arange(mi.UInt32, width * height * n)  # pixel-major, front to back
+    pixel, rank = pair // n, pair % n
+    surfel = dr.gather(mi.UInt32, mi.UInt32(order), rank)
+    of = lambda kind, name: dr.gather(kind, getattr(surfels, name).array, surfel)
+
+    d = mi.Vector3f(np.ascontiguousarray(camera.rays().reshape(-1, 3).T.astype(np.float32)))  # camera-space z is 1
+    d = dr.gather(mi.Vector3f, d, pixel)
+    t_u, t_v, normal = (dr.gather(mi.Vector3f, v, surfel) for v in surfels.frames())
+    centre, scales, z = dr.gather(mi.Point3f, centers, surfel) - origin, of(mi.Vector2f, "scales"), dr.gather(mi.Float, depth, surfel)
+    facing = dr.dot(centre, normal)
+    t = facing / dr.dot(d, normal)
+    u, v = dr.dot(t * d - centre, t_u) / scales.x, dr.dot(t * d - centre, t_v) / scales.y
+    projected = mi.Vector2f(dr.dot(centre, x_axis) * camera.focal[0], dr.dot(centre, y_axis) * camera.focal[1]) / z
+    offset = mi.Vector2f(mi.Float(pixel % width) + 0.5, mi.Float(pixel // width) + 0.5) - mi.Vector2f(camera.principal)
+    on_plane = dr.select(t > 0, u * u + v * v, dr.largest(mi.Float))
+    on_screen = LOW_PASS * dr.squared_norm(offset - projected)
+    alpha = of(mi.Float, "opacities") * dr.exp(-0.5 * dr.minimum(on_plane, on_screen))
+    alpha = dr.select(alpha > cutoffs.alpha_min, dr.minimum(alpha, cutoffs.alpha_max), 0)
+    dr.eval(alpha)
+
+    T, weight = dr.ones(mi.Float, width * height), dr.zeros(mi.Float, width * height * n)
+    for i in range(n):
+        at = dr.arange(mi.UInt32, width * height) * n + i
+        w = dr.select(T > cutoffs.transmittance_min, T * dr.gather(mi.Float, alpha, at), 0)
+        dr.scatter(weight, w, at)
+        T = T - w
+
+    delta = of(mi.Vector3f, "delta_normal")
+    radiance = dr.gather(mi.Color3f, surfels.radiance(dr.normalize(centers - origin)), surfel)
+    accumulate = lambda kind, value: kind(*[dr.block_sum(weight * c, n) for c in (value if kind is not mi.Float else [value])])
+    return GBuffer(
+        (width, height), diffuse=accumulate(mi.Color3f, radiance),
+        normal=accumulate(mi.Vector3f, dr.select(facing > 0, -normal, normal) + delta),
+        base_color=accumulate(mi.Color3f, of(mi.Color3f, "base_color")),
+        roughness=accumulate(mi.Float, of(mi.Float, "roughness")), metallic=accumulate(mi.Float, of(mi.Float, "metallic")),
+        delta_normal=accumulate(mi.Vector3f, delta), depth=accumulate(mi.Float, dr.select(on_plane <= on_screen, t, z)),
+        alpha=accumulate(mi.Float, mi.Float(1)), seen=None)

@@ -1,0 +1,90 @@
+"""Flat Gaussians that carry a principled material: the fields, their frames and their radiance.
+
+A surfel is the 2DGS primitive: a centre, two tangents with a standard deviation each, and an opacity. Its material has the
+names of Mitsuba's principled BSDF, so that a cloud of surfels is a principled material (`method.md` §1).
+"""
+
+from dataclasses import dataclass, fields
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+#: Channels of each field; `sh` has 3 (L+1)^2 of them, coefficient-major: sh[:, 3 k + c] is coefficient k of colour c.
+CHANNELS = {"centers": 3, "rotations": 4, "scales": 2, "opacities": 1, "sh": None, "base_color": 3, "roughness": 1,
+            "metallic": 1, "delta_normal": 3}
+
+
+@dataclass
+class Surfels:
+    """N surfels. Every field is a ``mi.TensorXf`` of shape [N, channels] in its physical range.
+
+      centers       world space
+      rotations     unit quaternions (x, y, z, w); the columns of their matrix are the tangents t_u, t_v and the normal
+      scales        standard deviations along t_u and t_v, world units, > 0
+      opacities     in (0, 1)
+      sh            diffuse radiance, linear: max(0, 1/2 + sum_k sh_k Y_k(d)), d from the camera to the centre (3DGS)
+      base_color, roughness, metallic   principled BSDF parameters in [0, 1]
+      delta_normal  the residual Δn that is added to the normal (RGS, eq. of N)
+    """
+
+    centers: "mi.TensorXf"
+    rotations: "mi.TensorXf"
+    scales: "mi.TensorXf"
+    opacities: "mi.TensorXf"
+    sh: "mi.TensorXf"
+    base_color: "mi.TensorXf"
+    roughness: "mi.TensorXf"
+    metallic: "mi.TensorXf"
+    delta_normal: "mi.TensorXf"
+
+    def __len__(self):
+        return self.centers.shape[0]
+
+    @classmethod
+    def from_numpy(cls, arrays: dict) -> "Surfels":
+        """From float32 arrays, one a field."""
+        return cls(**{name: mi.TensorXf(np.ascontiguousarray(arrays[name], np.float32)) for name in CHANNELS})
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """One float32 array a field, detached."""
+        return {f.name: dr.detach(getattr(self, f.name)).numpy() for f in fields(self)}
+
+    def column(self, kind, name):
+        """Field ``name`` as a Dr.Jit array with one lane a surfel, e.g. ``column(mi.Point3f, "centers")``."""
+        return dr.unravel(kind, getattr(self, name).array)
+
+    def frames(self):
+        """(t_u, t_v, n): unit tangents and normal of every surfel in world space, each ``mi.Vector3f`` of width N."""
+        x, y, z, w = dr.normalize(self.column(mi.Vector4f, "rotations"))
+        t_u = mi.Vector3f(1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w))
+        t_v = mi.Vector3f(2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w))
+        n = mi.Vector3f(2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y))
+        return t_u, t_v, n
+
+    def radiance(self, direction):
+        """Diffuse radiance of every surfel seen along unit ``direction`` (from the camera), ``mi.Color3f`` of width N."""
+        stride = self.sh.shape[1]
+        index = dr.arange(mi.UInt32, len(self)) * stride
+        basis = dr.sh_eval(direction, sh_order(stride))
+        value = mi.Color3f(0.5)
+        for k, Y in enumerate(basis):
+            value += Y * mi.Color3f(*[dr.gather(mi.Float, self.sh.array, index + (3 * k + c)) for c in range(3)])
+        return dr.maximum(value, 0)
+
+
+def sh_order(channels: int) -> int:
+    """Order L of spherical harmonics stored in ``channels`` = 3 (L+1)^2 numbers."""
+    return round((channels / 3) ** 0.5) - 1
+
+
+def rotation_from_normal(normal: np.ndarray, spin: np.ndarray | float = 0.0) -> np.ndarray:
+    """Quaternions [N, 4] (x, y, z, w) that turn +z to unit ``normal`` [N, 3], after a turn by ``spin`` radians about z."""
+    x, y, z = np.asarray(normal, np.float64).T
+    half = np.stack([-y, x, np.zeros_like(x), 1 + z], 1)
+    half[z < -0.999999] = [1, 0, 0, 0]
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    c, s = np.cos(np.asarray(spin) / 2) * np.ones_like(x), np.sin(np.asarray(spin) / 2) * np.ones_like(x)
+    # half * (0, 0, s, c), with half.z = 0
+    hx, hy, _, hw = half.T
+    return np.stack([hx * c + hy * s, hy * c - hx * s, hw * s, hw * c], 1).astype(np.float32)

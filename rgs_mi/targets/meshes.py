@@ -1,0 +1,104 @@
+"""Triangle meshes from smooth surfaces: grids, tubes, lathes. Faces are counter-clockwise seen from outside."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """vertices [V, 3] float32, faces [F, 3] uint32, normals [V, 3] float32 (unit, outward, smooth)."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray
+
+    def select(self, keep: np.ndarray) -> "Mesh":
+        """The faces where ``keep`` [F] is true, with the normals of the whole surface."""
+        used, faces = np.unique(self.faces[keep], return_inverse=True)
+        return Mesh(self.vertices[used], faces.reshape(-1, 3).astype(np.uint32), self.normals[used])
+
+
+def unit(v: np.ndarray) -> np.ndarray:
+    """[..., 3] vectors scaled to length 1 (0 stays 0)."""
+    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-20)
+
+
+def weld(points: np.ndarray, faces: np.ndarray) -> Mesh:
+    """A mesh of points [N, 3] and faces [F, 3] in which equal points are one vertex and flat faces are gone.
+
+    A vertex normal is the sum of its faces' area vectors, normalised.
+    """
+    keys, index, inverse = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
+    vertices, faces = points[index], inverse.reshape(-1)[faces]
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    area = np.cross(b - a, c - a)
+    normals = np.stack([np.bincount(faces.ravel(), np.repeat(area[:, k], 3), len(vertices)) for k in range(3)], -1)
+    return Mesh(vertices.astype(np.float32), faces.astype(np.uint32), unit(normals).astype(np.float32))
+
+
+def grid_faces(rows: int, columns: int) -> np.ndarray:
+    """[2 * (rows - 1) * (columns - 1), 3] faces between the points of a grid, row by row.
+
+    Outside is where (along a row) x (down a column) points.
+    """
+    i = np.arange((rows - 1) * columns).reshape(rows - 1, columns)[:, :-1].ravel()
+    a, b, c, d = i, i + 1, i + columns, i + columns + 1
+    return np.stack([a, b, d, a, d, c], -1).reshape(-1, 3)
+
+
+def grid(points: np.ndarray) -> Mesh:
+    """The surface through points [R, C, 3]. Seams and poles close because their points coincide."""
+    return weld(points.reshape(-1, 3), grid_faces(*points.shape[:2]))
+
+
+def tube(curve: np.ndarray, up: np.ndarray, width, height, sides: int = 32) -> Mesh:
+    """A tube around a curve, with elliptical cross-sections; closed where the curve or its sizes close it.
+
+    Args:
+      curve: [N, 3] centres; a loop repeats its first point at the end
+      up:    [N, 3] or [3] direction of the height, made perpendicular to the curve
+      width, height: [N] or float, half axes of the ellipse
+    """
+    first, last = curve[0], curve[-1]
+    if np.allclose(first, last):
+        padded = np.vstack([curve[-2], curve[:-1], first, curve[1]])
+    else:
+        padded = np.vstack([2 * first - curve[1], curve, 2 * last - curve[-2]])
+    tangent = unit(padded[2:] - padded[:-2])
+    side = unit(np.cross(tangent, np.broadcast_to(up, curve.shape)))
+    up = np.cross(side, tangent)
+    width, height = (np.broadcast_to(x, len(curve))[:, None, None] for x in (width, height))
+    c, s = _circle(sides)
+    return grid((padded[1:-1, None] + width * c * side[:, None] + height * s * up[:, None])[:, ::-1])
+
+
+def _circle(sides: int) -> np.ndarray:
+    """[2, sides + 1, 1] cosines and sines around a circle, the last exactly the first."""
+    a = 2 * np.pi * (np.arange(sides + 1) % sides) / sides
+    return np.stack([np.cos(a), np.sin(a)])[..., None]
+
+
+def lathe(profile: np.ndarray, origin: np.ndarray, axis: np.ndarray, sides: int = 96) -> Mesh:
+    """A solid of revolution: profile [N, 2] of (radius, height along the axis), from the top down."""
+    axis = unit(np.asarray(axis, float))
+    x = unit(np.cross(axis, [0.0, 0, 1] if abs(axis[2]) < 0.9 else [1.0, 0, 0]))
+    y = np.cross(axis, x)
+    c, s = _circle(sides)
+    r, h = profile.T[:, :, None, None]
+    return grid((origin + r * (c * x + s * y) + h * axis)[:, ::-1])
+
+
+def join(*meshes: Mesh) -> Mesh:
+    """Several meshes as one."""
+    offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
+    return Mesh(np.concatenate([m.vertices for m in meshes]),
+                np.concatenate([m.faces + o for m, o in zip(meshes, offsets)]).astype(np.uint32),
+                np.concatenate([m.normals for m in meshes]))
+
+
+def mirrored(mesh: Mesh) -> Mesh:
+    """The mirror image through the plane y = 0."""
+    flip = np.float32([1, -1, 1])
+    return Mesh(mesh.vertices * flip, mesh.faces[:, ::-1].copy(), mesh.normals * flip)

@@ -1,0 +1,27 @@
+"""Small scenes that several tests share."""
+
+import numpy as np
+
+from rgs_mi.camera import Camera
+from rgs_mi.surfel import Surfels, rotation_from_normal
+
+
+def sphere_surfels(n, seed=0, scale=0.6, opacity_shift=1.0, order=1):
+    """``n`` random surfels on the unit sphere, of all materials."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(n, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    normal = x + 0.1 * rng.normal(size=(n, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    logistic = lambda v: 1 / (1 + np.exp(-v))
+    return Surfels.from_numpy({
+        "centers": x, "rotations": rotation_from_normal(normal, rng.uniform(0, 6, n)),
+        "scales": np.exp(rng.normal(size=(n, 2)) * 0.3) * np.sqrt(4 * np.pi / n) * scale,
+        "opacities": logistic(rng.normal(size=(n, 1)) + opacity_shift), "sh": rng.normal(size=(n, 3 * (order + 1) ** 2)) * 0.1,
+        "base_color": rng.uniform(0.2, 0.9, (n, 3)), "roughness": rng.uniform(0.1, 0.9, (n, 1)),
+        "metallic": rng.uniform(0.1, 0.9, (n, 1)), "delta_normal": rng.normal(size=(n, 3)) * 0.05})
+
+
+def orbit_camera(angle=0.3, size=(48, 40), distance=4.0, fov=38.0):
+    """A camera on a circle about the z axis that looks at the origin."""
+    return Camera.look_at([distance * np.cos(angle), distance * np.sin(angle), 0.8], [0, 0, 0], [0, 0, 1], fov, size)
