@@ -27,6 +27,7 @@ from .errors import UserError
 
 FOV = 39.6                  # degrees, Blender's default camera (0.691 rad)
 MARGIN = 1.04               # between the object's bounding sphere and the frame
+TEST_SPP = 4                # times the samples of a training view: noise in a test view counts against every score
 AOV_GRID = 4                # samples per pixel and axis of the geometry pass
 AOV_CHANNELS = ("Depth.Z", "Normal.X", "Normal.Y", "Normal.Z", "Albedo.R", "Albedo.G", "Albedo.B",
                 "Roughness", "Metallic", "Alpha")
@@ -62,7 +63,6 @@ def bounds(scene) -> tuple[np.ndarray, float]:
 
     Raises: UserError when the scene holds no geometry.
     """
-
     box = scene.bbox()
     if not scene.shapes() or not box.valid():
         raise UserError("the scene has no shapes: nothing to look at")
@@ -89,23 +89,23 @@ def _farthest(shape, point: np.ndarray) -> float:
 class Renderer:
     """A loaded scene and one camera that moves: kernels are compiled for the first view only."""
 
-    def __init__(self, scene, size: int, spp: int):
+    def __init__(self, scene, size: int):
         import mitsuba as mi
 
         camera = Camera.look_at((1, 0, 0), (0, 0, 0), (0, 0, 1), FOV, (size, size))
         sensor = camera.to_sensor_dict()
         sensor["film"] |= {"pixel_format": "rgba", "component_format": "float32", "rfilter": {"type": "gaussian"}}
-        sensor["sampler"] = {"type": "multijitter", "sample_count": spp}
+        sensor["sampler"] = {"type": "multijitter"}
         self.scene, self.sensor = scene, mi.load_dict(sensor)
         self.params = mi.traverse(self.sensor)
 
-    def radiance(self, camera: Camera, seed: int) -> np.ndarray:
+    def radiance(self, camera: Camera, spp: int, seed: int) -> np.ndarray:
         """[H, W, 4] float32 linear radiance, premultiplied, by the scene's integrator."""
         import mitsuba as mi
 
         self.params["to_world"] = camera.to_sensor_dict()["to_world"]
         self.params.update()
-        return np.array(mi.render(self.scene, sensor=self.sensor, seed=seed))
+        return np.array(mi.render(self.scene, sensor=self.sensor, spp=spp, seed=seed))
 
     def aov(self, camera: Camera) -> np.ndarray:
         """[H, W, 10] float32 maps in the order of `AOV_CHANNELS`, from a regular grid of samples in each pixel."""
@@ -250,7 +250,7 @@ def _frame(split: str, index: int, camera: Camera) -> dict:
     return {"file_path": f"./{split}/r_{index}", "transform_matrix": (camera.to_world @ _CV_TO_BLENDER).tolist()}
 
 
-def render_dataset(xml, out, *, train: int = 60, test: int = 20, size: int = 400, spp: int = 64,
+def render_dataset(xml, out, *, train: int = 60, test: int = 20, size: int = 400, spp: int = 25,
                    radius: float | None = None, variables: dict | None = None, seed: int = 0,
                    quiet: bool = False) -> Path:
     """Render a Mitsuba scene into a data set in the Blender layout (see the module), or return the one that is there.
@@ -258,7 +258,7 @@ def render_dataset(xml, out, *, train: int = 60, test: int = 20, size: int = 400
     Args:
       xml: scene file; variables: its ``<default>``s to override
       out: folder to write; train, test: numbers of views; size: pixels along the side of the square pictures
-      spp: samples per pixel of the photographs
+      spp: samples per pixel of the training views; test views take `TEST_SPP` times as many. Rounded up to a grid.
       radius: distance of the cameras from the centre of the scene's bounding box; None fits the object into the frame
       seed: turns the cameras around the object and reseeds the sampler
 
@@ -287,11 +287,12 @@ def render_dataset(xml, out, *, train: int = 60, test: int = 20, size: int = 400
     cameras = {split: [Camera.look_at(center + distance * d, center, (0, 0, 1), FOV, (size, size)) for d in ds]
                for split, ds in directions.items()}
     views = [(split, i, camera) for split, cs in cameras.items() for i, camera in enumerate(cs)]
-    renderer = Renderer(scene, size, spp)
+    renderer = Renderer(scene, size)
     for number, (split, i, camera) in enumerate(_progress(views, f"rendering {xml.name}", quiet)):
         stem = out / split / f"r_{i}"
         if not stem.with_suffix(".png").is_file():
-            _write_view(stem, renderer.radiance(camera, seed * len(views) + number), renderer.aov(camera))
+            samples = spp * (TEST_SPP if split == "test" else 1)
+            _write_view(stem, renderer.radiance(camera, samples, seed * len(views) + number), renderer.aov(camera))
     for split, cs in cameras.items():
         frames = [_frame(split, i, camera) for i, camera in enumerate(cs)]
         _write_json(out / f"transforms_{split}.json", {"camera_angle_x": math.radians(FOV), "frames": frames})

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes import orbit_camera, sphere_surfels
 
-from rgs_mi.splat.gbuffer import render_gbuffer
+from rgs_mi.splat import gbuffer
 from rgs_mi.splat.reference import render_gbuffer_reference
 from rgs_mi.splat.tiles import Cutoffs
 from rgs_mi.surfel import CHANNELS, Surfels
@@ -17,15 +17,19 @@ MAPS = ("diffuse", "normal", "base_color", "roughness", "metallic", "delta_norma
 SMOOTH = Cutoffs(alpha_min=1e-7, alpha_max=0.9999, transmittance_min=0)
 
 
-def stacked(gbuffer):
+def render_gbuffer(surfels, camera, cutoffs=Cutoffs()):
+    return gbuffer.render_gbuffer(surfels, camera, cutoffs=cutoffs).maps()
+
+
+def stacked(maps):
     """All maps as one array [K, pixels]."""
-    return np.concatenate([np.atleast_2d(getattr(gbuffer, name).numpy()) for name in MAPS])
+    return np.concatenate([np.atleast_2d(getattr(maps, name).numpy()) for name in MAPS])
 
 
-def inner(gbuffer, weights):
+def inner(maps, weights):
     """<weights, maps> as a Dr.Jit scalar."""
-    columns = [c for name in MAPS for c in (getattr(gbuffer, name) if name in
-               ("diffuse", "normal", "base_color", "delta_normal") else [getattr(gbuffer, name)])]
+    columns = [c for name in MAPS for c in (getattr(maps, name) if name in
+               ("diffuse", "normal", "base_color", "delta_normal") else [getattr(maps, name)])]
     return sum(dr.sum(c * mi.Float(w)) for c, w in zip(columns, weights))
 
 

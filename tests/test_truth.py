@@ -112,11 +112,11 @@ def count_renders(monkeypatch, limit=None):
     """Count calls of the renderer; the one after ``limit`` dies as if the process had been interrupted."""
     calls, original = [], truth.Renderer.radiance
 
-    def radiance(self, camera, seed):
+    def radiance(self, camera, spp, seed):
         if len(calls) == limit:
             raise KeyboardInterrupt
         calls.append(seed)
-        return original(self, camera, seed)
+        return original(self, camera, spp, seed)
 
     monkeypatch.setattr(truth.Renderer, "radiance", radiance)
     return calls

@@ -8,13 +8,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .gbuffer import GBuffer
+from .gbuffer import Maps
 from .project import NEAR
 from .tiles import LOW_PASS, Cutoffs
 
 
-def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> GBuffer:
-    """The same maps as `render_gbuffer`, in the same frames and units, without `seen`."""
+def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> Maps:
+    """The same maps as `render_gbuffer`, in the same frames and units."""
     width, height = camera.size
     origin = mi.Point3f(camera.origin)
     x_axis, y_axis, z_axis = (mi.Vector3f(row) for row in camera.rotation)
@@ -54,10 +54,10 @@ def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> GBuffer:
     delta = of(mi.Vector3f, "delta_normal")
     radiance = dr.gather(mi.Color3f, surfels.radiance(dr.normalize(centers - origin)), surfel)
     accumulate = lambda kind, value: kind(*[dr.block_sum(weight * c, n) for c in (value if kind is not mi.Float else [value])])
-    return GBuffer(
-        (width, height), diffuse=accumulate(mi.Color3f, radiance),
+    return Maps(
+        diffuse=accumulate(mi.Color3f, radiance),
         normal=accumulate(mi.Vector3f, dr.select(facing > 0, -normal, normal) + delta),
         base_color=accumulate(mi.Color3f, of(mi.Color3f, "base_color")),
         roughness=accumulate(mi.Float, of(mi.Float, "roughness")), metallic=accumulate(mi.Float, of(mi.Float, "metallic")),
         delta_normal=accumulate(mi.Vector3f, delta), depth=accumulate(mi.Float, dr.select(on_plane <= on_screen, t, z)),
-        alpha=accumulate(mi.Float, mi.Float(1)), seen=None)
+        alpha=accumulate(mi.Float, mi.Float(1)))

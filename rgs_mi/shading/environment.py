@@ -1,0 +1,95 @@
+"""Lookups in a latitude-longitude environment, with the conventions of Mitsuba's `envmap` emitter.
+
+Texel column c lies at longitude 2π (c + 1/2)/W, row r at colatitude π r/(H − 1): the first and last rows are the poles.
+A direction d in the emitter's frame has longitude atan2(d_x, −d_z) and colatitude acos(d_y).
+"""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import prefilter as _prefilter
+
+
+@dataclass
+class Environment:
+    """A learned or loaded environment.
+
+      texels:   ``mi.TensorXf`` [rows, columns, 3], linear radiance (scale included), without the emitter's halo columns
+      rotation: [3, 3] emitter frame to world frame
+    """
+
+    texels: "mi.TensorXf"
+    rotation: np.ndarray
+
+    @property
+    def size(self):
+        return self.texels.shape[:2]
+
+    @classmethod
+    def from_emitter(cls, emitter) -> "Environment":
+        """From a Mitsuba `envmap`; gradients of its ``data`` and ``scale`` are kept."""
+        params = mi.traverse(emitter)
+        data = params["data"]
+        rows, padded, _ = data.shape
+        texels = data[:, 1:padded - 1, :] * params["scale"]
+        rotation = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)[:3, :3]
+        return cls(texels, rotation)
+
+    def to_local(self, d):
+        """World-space directions in the emitter's frame."""
+        inverse = np.linalg.inv(self.rotation)
+        return mi.Matrix3f([[dr.opaque(mi.Float, float(v)) for v in row] for row in inverse]) @ d
+
+    def filtered(self) -> "FilteredEnvironment":
+        """The environment convolved with the BSDF's lobe at every roughness level."""
+        operator = _prefilter.prefilter(*self.size, mi.variant())
+        return FilteredEnvironment(_prefilter.apply(self.texels.array, operator), operator, self)
+
+
+@dataclass
+class FilteredEnvironment:
+    """``texels``: all levels of `Prefilter`, padded to four floats a texel."""
+
+    texels: "mi.Float"
+    operator: _prefilter.Prefilter
+    environment: Environment
+
+    def _level(self, longitude, colatitude, level):
+        """Bilinear lookup in map number ``level`` (one a lane); longitude and colatitude in [0, 1]."""
+        constant = lambda values: dr.gather(mi.UInt32, mi.UInt32(np.asarray(values, np.uint32)), level)
+        rows, columns = (constant([size[i] for size in self.operator.maps]) for i in (0, 1))
+        first = constant(self.operator.offsets)
+        x = longitude * mi.Float(columns) - 0.5
+        y = colatitude * mi.Float(rows - 1)
+        column, row = dr.floor(x), dr.minimum(dr.floor(y), mi.Float(rows) - 2)
+        fx, fy = x - column, y - row
+        # no integer division by `columns`: idle lanes hold zero there, and the processor traps
+        left = dr.select(column < 0, columns - 1, mi.UInt32(dr.maximum(column, 0)))
+        right = dr.select(left + 1 < columns, left + 1, 0)
+        above = first + mi.UInt32(row) * columns
+        fetch = lambda i: dr.gather(mi.Vector4f, self.texels, i, mode=dr.ReduceMode.Local)
+        top = dr.lerp(fetch(above + left), fetch(above + right), fx)
+        bottom = dr.lerp(fetch(above + columns + left), fetch(above + columns + right), fx)
+        value = dr.lerp(top, bottom, fy)
+        return mi.Color3f(value.x, value.y, value.z)
+
+    def eval(self, direction, roughness=None):
+        """Radiance along world-space unit ``direction``, averaged over the lobe of ``roughness``; None: unfiltered."""
+        d = self.environment.to_local(direction)
+        # atan2 and acos have no derivative at the poles, where longitude does not matter: stay clear of them
+        horizontal = dr.maximum(dr.square(d.x) + dr.square(d.z), 1e-10)
+        longitude = dr.atan2(d.x, dr.select(dr.abs(d.z) + dr.abs(d.x) > 1e-5, -d.z, 1e-5)) / dr.two_pi
+        longitude -= dr.floor(longitude)
+        colatitude = dr.atan2(dr.sqrt(horizontal), d.y) / dr.pi
+        if roughness is None:
+            return self._level(longitude, colatitude, mi.UInt32(0))
+        nodes = [r for r, _ in _prefilter.LEVELS]
+        position = mi.Float(0)
+        for low, high in zip(nodes[:-1], nodes[1:]):
+            position += dr.clip((roughness - low) / (high - low), 0, 1)
+        level = dr.minimum(mi.UInt32(dr.detach(position)), len(nodes) - 2)
+        return dr.lerp(self._level(longitude, colatitude, level), self._level(longitude, colatitude, level + 1),
+                       position - mi.Float(level))

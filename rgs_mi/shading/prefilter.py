@@ -1,0 +1,141 @@
+"""The environment filtered once per roughness level: a fixed linear operator on its texels.
+
+The map is latitude-longitude, and a filter that only depends on the angle between directions commutes with turning the
+map about its axis. So along longitude it is a circular convolution, and in Fourier space the operator falls apart into one
+small real matrix per longitudinal frequency m:
+
+    P̂_m = M_m L̂_m,   M_m[i, j] = ∫∫ K(γ(θ_i, θ, Δφ)) hat_j(θ) sinθ cos(mΔφ) dθ dΔφ · sinc²           (5)
+
+with K the principled BSDF's lobe (`tables.lobe`), γ the angle between the directions, and hats because Mitsuba's
+`envmap` interpolates bilinearly. Rows are normalised: a constant environment stays constant. Nothing is truncated, the
+poles are exact, and the adjoint is the transpose of (5).
+"""
+
+import functools
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import fft
+
+from .tables import lobe
+
+#: Roughness of each level and the rows of its map; None: the environment's own. Level 0 is the mirror: no filter.
+LEVELS = ((0.0, None), (0.1, None), (0.2, None), (0.3, 64), (0.4, 64), (0.55, 32), (0.7, 32), (0.85, 16), (1.0, 16))
+_FINE_ROWS = 4  # quadrature nodes per row of texels
+
+
+def _kernel_matrix(roughness, rows, columns, out_rows):
+    """[M, out_rows, rows] of (5), M = frequencies of the output."""
+    frequencies = min(columns, 2 * out_rows) // 2 + 1
+    fine = (rows - 1) * _FINE_ROWS + 1
+    theta = np.linspace(0, np.pi, fine)
+    samples = columns * 2
+    delta = 2 * np.pi * np.arange(samples // 2 + 1) / samples  # the kernel is even in Δφ
+    # the lobe against its angle, dense where it is narrow
+    angles = np.pi / 2 * np.linspace(0, 1, 4096) ** 2
+    table = lobe(roughness, angles)
+    hat = np.maximum(0, 1 - np.abs(np.arange(fine)[:, None] / _FINE_ROWS - np.arange(rows)))  # [fine, rows]
+    hat *= np.sin(theta)[:, None]
+    theta_out = np.linspace(0, np.pi, out_rows)
+    matrix = np.empty((frequencies, out_rows, rows), np.float32)
+    for i, t in enumerate(theta_out):
+        cosine = np.cos(t) * np.cos(theta)[:, None] + np.sin(t) * np.sin(theta)[:, None] * np.cos(delta)
+        gamma = np.arccos(np.clip(cosine, -1, 1))
+        kernel = np.interp(gamma, angles, table, right=0.0)
+        spectrum = fft.dct(kernel, type=1, axis=1)[:, :frequencies]  # cosine series of an even function
+        matrix[:, i] = spectrum.T @ hat
+    matrix *= (np.sinc(np.arange(frequencies) / columns) ** 2)[:, None, None]
+    return matrix / matrix[0].sum(1)[None, :, None]
+
+
+@dataclass(frozen=True)
+class Prefilter:
+    """The operator for environments of ``size`` (rows, columns). ``maps`` are the (rows, columns) of each level's map."""
+
+    size: tuple[int, int]
+    maps: tuple[tuple[int, int], ...]
+    matrices: tuple[np.ndarray, ...]
+
+    @property
+    def offsets(self) -> np.ndarray:
+        """[levels] first texel of each level in the concatenated output."""
+        return np.concatenate([[0], np.cumsum([r * c for r, c in self.maps])[:-1]]).astype(np.uint32)
+
+    @property
+    def texels(self) -> int:
+        """Texels of all levels together."""
+        return sum(r * c for r, c in self.maps)
+
+    def apply(self, texels: np.ndarray) -> np.ndarray:
+        """[rows, columns, 3] float32 to the maps of all levels, [texels, 3]."""
+        rows, columns = self.size
+        spectrum = fft.rfft(texels.transpose(1, 0, 2), axis=0)  # [M, rows, 3]
+        out = [texels.reshape(-1, 3)]
+        for (r, c), matrix in zip(self.maps[1:], self.matrices):
+            m = matrix.shape[0]
+            product = matrix @ spectrum[:m].view(np.float32)
+            level = product.view(np.complex64) * self._phase(m, c)[:, None, None] * np.float32(c / columns)
+            out.append(fft.irfft(level, n=c, axis=0).transpose(1, 0, 2).reshape(-1, 3))
+        return np.concatenate(out)
+
+    def transpose(self, adjoint: np.ndarray) -> np.ndarray:
+        """[texels, 3] to [rows, columns, 3]: the transpose of `apply`."""
+        rows, columns = self.size
+        first = rows * columns
+        spectrum = np.zeros((columns // 2 + 1, rows, 3), np.complex64)
+        for (r, c), matrix, offset in zip(self.maps[1:], self.matrices, self.offsets[1:]):
+            m = matrix.shape[0]
+            level = adjoint[offset:offset + r * c].reshape(r, c, 3).transpose(1, 0, 2)
+            level = fft.rfft(level, axis=0)[:m] * self._phase(m, c).conj()[:, None, None]
+            if c % 2 == 0 and m == c // 2 + 1 and c < columns:
+                level[-1] *= 0.5  # irfft reads the highest frequency of a short map once, of a long one twice
+            spectrum[:m] += (matrix.transpose(0, 2, 1) @ np.ascontiguousarray(level).view(np.float32)).view(np.complex64)
+        grad = fft.irfft(spectrum, n=columns, axis=0).transpose(1, 0, 2)
+        return grad + adjoint[:first].reshape(rows, columns, 3)
+
+    def _phase(self, m, c):
+        """Texel centres lie half a texel from Δφ = 0, and texels of a coarser map are wider."""
+        shift = np.pi / c - np.pi / self.size[1]
+        return np.exp(1j * np.arange(m) * shift).astype(np.complex64)
+
+
+@functools.lru_cache(maxsize=4)
+def prefilter(rows: int, columns: int, variant: str) -> Prefilter:
+    """The operator for an environment of rows × columns texels; some seconds the first time. ``variant`` keys the cache."""
+    maps, matrices = [(rows, columns)], []
+    for roughness, level_rows in LEVELS[1:]:
+        out_rows = min(level_rows or rows, rows)
+        out_columns = columns if out_rows == rows else 2 * out_rows
+        maps.append((out_rows, out_columns))
+        matrices.append(_kernel_matrix(roughness, rows, columns, out_rows))
+    return Prefilter((rows, columns), tuple(maps), tuple(matrices))
+
+
+class _Apply(dr.CustomOp):
+    """`Prefilter.apply` on Dr.Jit arrays: texels [rows · columns · 3] to [texels · 4] (padded for packet gathers)."""
+
+    def eval(self, texels, operator):
+        self.operator = operator
+        return self._pad(operator.apply(texels.numpy().reshape(*operator.size, 3)))
+
+    def forward(self):
+        self.set_grad_out(self._pad(self.operator.apply(self.grad_in("texels").numpy().reshape(*self.operator.size, 3))))
+
+    def backward(self):
+        adjoint = np.ascontiguousarray(self.grad_out().numpy().reshape(-1, 4)[:, :3])
+        self.set_grad_in("texels", mi.Float(self.operator.transpose(adjoint).astype(np.float32).ravel()))
+
+    @staticmethod
+    def _pad(values):
+        return mi.Float(np.pad(values.astype(np.float32), ((0, 0), (0, 1))).ravel())
+
+    def name(self):
+        return "rgs_mi.shading.Prefilter"
+
+
+def apply(texels, operator: Prefilter):
+    """Filtered maps of all levels, ``mi.Float`` of width operator.texels · 4; differentiable in ``texels``, the flat
+    ``mi.Float`` of an environment's rows × columns × 3 values."""
+    return dr.custom(_Apply, texels, operator)

@@ -1,0 +1,76 @@
+"""What Mitsuba's principled BSDF reflects: numerical integrals of its specular part.
+
+With diffuse lobes off, the principled BSDF is linear in its Fresnel terms. For metallic m and base colour c it reflects
+
+    E = (1 − m) E_dielectric + m (c (E_white − E_black) + E_black)                                 (4)
+
+where the three terms are the directional albedos of its dielectric (base colour 0), of a white metal and of a black
+metal (whose Schlick Fresnel term still rises to one at grazing angles). They depend on n·ω_o and roughness alone and are
+integrated here by evaluating the plugin itself; only the choice of sample directions is ours.
+"""
+
+import functools
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+COSINES = 48
+ROUGHNESSES = 32
+_SIDE = 48  # stratified samples along each dimension
+MIN_ROUGHNESS = 0.032  # the principled BSDF clamps its GGX width α = roughness² at 0.001
+
+
+def cosine_nodes() -> np.ndarray:
+    """[COSINES] values of n·ω_o at the table's rows: quadratic, since albedos bend near grazing angles."""
+    return np.linspace(0, 1, COSINES) ** 2
+
+
+def roughness_nodes() -> np.ndarray:
+    """[ROUGHNESSES] values of roughness at the table's columns."""
+    return np.linspace(0, 1, ROUGHNESSES)
+
+
+def principled(roughness: float, metallic: float, base_color: float, eta: float):
+    """A stock principled BSDF with constant parameters."""
+    return mi.load_dict({"type": "principled", "roughness": max(roughness, MIN_ROUGHNESS), "metallic": metallic, "eta": eta,
+                         "base_color": {"type": "rgb", "value": [base_color] * 3}})
+
+
+def interaction(wi):
+    """Surface interactions with local frame = world frame and incident directions ``wi``, one a lane."""
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(wi))
+    si.t, si.n, si.wi = mi.Float(1), mi.Normal3f(0, 0, 1), wi
+    si.sh_frame = mi.Frame3f(si.n)
+    return si
+
+
+@functools.lru_cache(maxsize=4)
+def albedo_table(eta: float, variant: str) -> np.ndarray:
+    """[COSINES, ROUGHNESSES, 3] float32: (E_dielectric, E_black, E_white) of (4). ``variant`` keys the cache."""
+    mu = np.maximum(cosine_nodes(), 1e-3)
+    wi = mi.Vector3f(mi.Float(np.sqrt(1 - mu**2)), 0, mi.Float(mu))
+    n = _SIDE * _SIDE
+    k = dr.arange(mi.UInt32, len(mu) * n)
+    sample = mi.Point2f(mi.Float(k % _SIDE) + 0.5, mi.Float((k // _SIDE) % _SIDE) + 0.5) / _SIDE
+    wi = dr.gather(mi.Vector3f, wi, k // n)
+    si = interaction(wi)
+    table = np.zeros((COSINES, ROUGHNESSES, 3), np.float32)
+    for column, roughness in enumerate(roughness_nodes()):
+        alpha = dr.opaque(mi.Float, max(roughness, MIN_ROUGHNESS) ** 2)
+        h, _ = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True).sample(wi, sample)
+        wo = mi.reflect(wi, h)
+        pdf = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True).pdf(wi, h) / (4 * dr.dot(wo, h))
+        valid = (wo.z > 0) & (pdf > 0)
+        for row, (metallic, base_color) in enumerate([(0, 0), (1, 0), (1, 1)]):
+            value = principled(float(roughness), metallic, base_color, eta).eval(mi.BSDFContext(), si, wo).x
+            table[:, column, row] = dr.block_sum(dr.select(valid, value / pdf, 0), n).numpy() / n
+    return table
+
+
+def lobe(roughness: float, angles: np.ndarray) -> np.ndarray:
+    """BSDF times cosine of a white metal seen along its normal, at ``angles`` (radians) from the normal: the shape of the
+    split-sum's filter kernel, not normalised."""
+    wo = mi.Vector3f(mi.Float(np.sin(angles)), 0, mi.Float(np.cos(angles)))
+    wi = mi.Vector3f(dr.zeros(mi.Float, len(angles)), 0, 1)
+    return principled(roughness, 1, 1, 1.5).eval(mi.BSDFContext(), interaction(wi), wo).x.numpy().astype(np.float64)
