@@ -6,7 +6,8 @@
     train/r_0.exr          RGBA, half float linear radiance, premultiplied alpha (as EXR has it)
     train/r_0_normal.png   world-space shading normal * 0.5 + 0.5, alpha = coverage
     train/r_0_aov.exr      float: Depth.Z (along the viewing axis), Normal.X/Y/Z (world), Albedo.R/G/B, Roughness,
-                           Metallic, Alpha; means over the covered part of a pixel, 0 where nothing is
+                           Metallic, Alpha; means over the covered part of a pixel, 0 where nothing is.
+                           Look channels up by name: EXR files keep them in alphabetical order
     truth.json             what was rendered: a second call with the same settings returns at once, another resumes
 
 The radiance is that of the scene's own integrator: with ``hide_emitters`` the background is transparent. Roughness and
@@ -26,7 +27,7 @@ from .camera import Camera
 from .errors import UserError
 
 FOV = 39.6                  # degrees, Blender's default camera (0.691 rad)
-MARGIN = 1.04               # between the object's bounding sphere and the frame
+MARGIN = 1.02               # keeps the object's bounding sphere off the frame
 TEST_SPP = 4                # times the samples of a training view: noise in a test view counts against every score
 AOV_GRID = 4                # samples per pixel and axis of the geometry pass
 AOV_CHANNELS = ("Depth.Z", "Normal.X", "Normal.Y", "Normal.Z", "Albedo.R", "Albedo.G", "Albedo.B",
@@ -231,8 +232,11 @@ def _prepare(out: Path, key: dict) -> bool:
             (out / f"transforms_{split}.json").unlink(missing_ok=True)
             for file in [*(out / split).glob("r_*"), *(out / split).glob(".r_*")]:
                 file.unlink()
-    for split in ("train", "test"):
-        (out / split).mkdir(parents=True, exist_ok=True)
+    try:
+        for split in ("train", "test"):
+            (out / split).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot make the folder {out}: {error.strerror}: choose another with --out") from error
     _write_json(manifest, {"key": key, "complete": False})
     return False
 

@@ -22,7 +22,7 @@ def main():
     parser.add_argument("--test", type=int, default=20, help="test views (default: %(default)s)")
     parser.add_argument("--size", type=int, default=400, help="pixels along a side (default: %(default)s)")
     parser.add_argument("--spp", type=int, default=25,
-                        help="samples per pixel of training views; test views take four times as many (default: %(default)s)")
+                        help="samples per pixel of training views, test views take 4 times that (default: %(default)s)")
     parser.add_argument("--radius", type=float, help="distance of the cameras (default: the object fills the frame)")
     parser.add_argument("-D", dest="define", action="append", default=[], metavar="NAME=VALUE",
                         help="a variable of the scene")

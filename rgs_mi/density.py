@@ -1,0 +1,73 @@
+"""Adaptive density control: clone, split, prune (3DGS § 5, 2DGS). The optimiser's moments follow the surfels."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .model import logit
+from .surfel import Surfels
+
+_SPLIT_SCALE = 1.6  # a split surfel's halves are that much smaller (3DGS)
+
+
+class Gradients:
+    """Running mean of the image-plane gradient of each surfel's centre, over the views that saw it."""
+
+    def __init__(self, n: int):
+        self.sum, self.count = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)
+
+    def add(self, gradient, seen, size):
+        """``gradient``: of the loss with respect to the projected centres in pixels, ``mi.Vector2f``; ``seen``: which
+        surfels the view of ``size`` (width, height) listed. Kept in NDC units, as 3DGS measures it."""
+        ndc = mi.Vector2f(gradient.x * (size[0] / 2), gradient.y * (size[1] / 2))
+        self.sum += dr.select(seen, dr.norm(ndc), 0)
+        self.count += dr.select(seen, mi.Float(1), 0)
+        dr.eval(self.sum, self.count)
+
+    def mean(self) -> np.ndarray:
+        """[N]; zero for surfels that no view saw."""
+        return self.sum.numpy() / np.maximum(self.count.numpy(), 1)
+
+
+def densify(model, gradients: Gradients, extent: float, settings, rng) -> None:
+    """One round of density control, in place. ``extent``: radius of the object in world units; ``settings``: `Density`.
+
+    Surfels whose mean gradient exceeds the threshold are cloned when small and split when large, the largest gradients
+    first while ``max_surfels`` lasts. Transparent, unseen and huge ones go.
+    """
+    gradient, seen = gradients.mean(), gradients.count.numpy() > 0
+    opacity = 1 / (1 + np.exp(-model.numpy("logit_opacities")[:, 0]))
+    scales = np.exp(model.numpy("log_scales"))
+    largest = scales.max(1)
+    keep = seen & (opacity > settings.prune_opacity) & (largest < 0.3 * extent)
+    if not keep.any():
+        return
+
+    hot = np.flatnonzero(keep & (gradient > settings.threshold))
+    room = max(0, settings.max_surfels - int(keep.sum()))
+    hot = hot[np.argsort(-gradient[hot], kind="stable")][:room]
+    split = hot[largest[hot] > settings.dense * extent]
+    clone = hot[largest[hot] <= settings.dense * extent]
+
+    stay = np.flatnonzero(keep)
+    index = np.concatenate([stay, clone, split])
+    changes = {name: model.numpy(name)[index] for name in ("centers", "log_scales", "logit_opacities")}
+    changes["fresh"] = np.arange(len(index)) >= len(stay)
+
+    # Both halves of a split are drawn from the parent; they lie in its plane.
+    parents = np.isin(stay, split)
+    halves = np.concatenate([np.flatnonzero(parents), np.arange(len(stay) + len(clone), len(index))])
+    t_u, t_v, _ = (v.numpy().T[index[halves]] for v in _frames(model))
+    jitter = rng.normal(size=(len(halves), 2)) * scales[index[halves]]
+    changes["centers"][halves] += (jitter[:, :1] * t_u + jitter[:, 1:] * t_v).astype(np.float32)
+    changes["log_scales"][halves] -= np.log(_SPLIT_SCALE)
+    # Two surfels on one spot cover as much as one did: 1 − (1 − o')² = o.
+    twins = np.concatenate([np.flatnonzero(np.isin(stay, clone)), np.arange(len(stay), len(stay) + len(clone))])
+    changes["logit_opacities"][twins, 0] = logit(1 - np.sqrt(1 - opacity[index[twins]]))
+    model.select(index, changes)
+
+
+def _frames(model):
+    surfels: Surfels = model.surfels(0)
+    with dr.suspend_grad():
+        return surfels.frames()

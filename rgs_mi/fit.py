@@ -1,0 +1,152 @@
+"""The fit: views → render → loss → gradient → step → density, under a budget."""
+
+import time
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from . import losses
+from .color import display
+from .density import Gradients, densify
+from .model import ENVIRONMENT, Model
+from .shading import deferred
+
+#: Rate of each parameter: the field of `Rates` that it obeys.
+_RATES = {"centers": "centers", "rotations": "rotations", "log_scales": "scales", "logit_opacities": "opacities",
+          "sh_dc": "sh_dc", "sh_rest": "sh_rest", "logit_base_color": "base_color", "logit_roughness": "roughness",
+          "logit_metallic": "metallic", "delta_normal": "delta_normal", ENVIRONMENT: "environment"}
+
+
+class Photographs:
+    """The training photographs of one pyramid level as the losses want them: display space, over the background."""
+
+    def __init__(self, views, downscale, background):
+        self.views, self.downscale, self.background = views, downscale, background
+        self._cache = {}
+
+    def __getitem__(self, i):
+        """(camera, colour ``mi.Color3f``, coverage ``mi.Float``) of view ``i``, a lane a pixel."""
+        view = self.views[i]
+        if i not in self._cache:
+            color = display(view.pixels, 0.0)
+            alpha = view.pixels[..., 3:].astype(np.float32) / (255 if view.pixels.dtype == np.uint8 else 1)
+            self._cache[i] = _shrink(np.concatenate([color, alpha], 2), self.downscale).astype(np.float16)
+        image = self._cache[i]
+        height, width, _ = image.shape
+        planes = [mi.Float(np.ascontiguousarray(image[..., c], np.float32).ravel()) for c in range(4)]
+        color = mi.Color3f(*planes[:3]) + self.background * (1 - planes[3])
+        return view.camera.resized(width, height), color, planes[3]
+
+
+def _shrink(image, factor):
+    """Mean over factor × factor blocks; the last rows and columns that fill no block are left out."""
+    height, width = (max(n // factor, 1) * factor if n >= factor else n for n in image.shape[:2])
+    if factor == 1 or min(image.shape[:2]) < factor:
+        return image
+    return image[:height, :width].reshape(height // factor, factor, width // factor, factor, -1).mean((1, 3))
+
+
+class Fit:
+    """A fit in progress: the model, how far it is, and one method a step.
+
+    ``settings``: `Settings`. ``extent``: radius of the object in world units. ``elapsed``: seconds spent so far, earlier
+    sessions included.
+    """
+
+    def __init__(self, dataset, model: Model, settings, extent: float, step=0, elapsed=0.0):
+        self.dataset, self.model, self.settings, self.extent = dataset, model, settings, extent
+        self.step_number, self.elapsed = step, elapsed
+        self.gradients = Gradients(len(model))
+        self.photographs = None
+        self.psnr = float("nan")
+
+    @property
+    def progress(self) -> float:
+        """Fraction of the budget that is spent, in [0, 1]."""
+        if self.settings.iterations is not None:
+            return min(1.0, self.step_number / self.settings.iterations)
+        return min(1.0, self.elapsed / (60 * self.settings.minutes))
+
+    @property
+    def stage(self):
+        return next((s for s in self.settings.stages if self.progress < s.until), self.settings.stages[-1])
+
+    @property
+    def sh_order(self) -> int:
+        """Spherical harmonics in use: one more band in each of equal parts of what follows ``sh_start``."""
+        s = self.settings
+        if s.sh_order == 0 or self.progress < s.sh_start:
+            return 0
+        return min(s.sh_order, 1 + int((self.progress - s.sh_start) / (1 - s.sh_start + 1e-9) * s.sh_order))
+
+    def step(self):
+        """One step of the optimiser on the next few views, and density control when it is due."""
+        start = time.monotonic()
+        stage, s = self.stage, self.settings
+        if self.photographs is None or self.photographs.downscale != stage.downscale:
+            self.photographs = Photographs(self.dataset.train, stage.downscale, s.background)
+        self._set_rates()
+        views = self._next_views(stage.views)
+        filtered = self.model.environment().filtered()
+        leaf = filtered.texels
+        errors = []
+        dr.enable_grad(*self.model.optimizer.values()) if False else None
+        surfels = self.model.surfels(self.sh_order)
+        for i in views:
+            errors.append(self._view(i, surfels, filtered, 1 / len(views)))
+        self.model.optimizer.step()
+        dr.eval(*self.model.optimizer.values())
+        self.psnr = -10 * np.log10(max(np.mean([float(e[0]) for e in errors]), 1e-10))
+        self.step_number += 1
+        self._control_density()
+        self.elapsed += time.monotonic() - start
+
+    def _view(self, i, surfels, filtered, weight):
+        """Accumulate the gradients of one view's loss; returns its mean squared error."""
+        camera, target, alpha = self.photographs[i]
+        w = self.settings.weights
+        offset = dr.zeros(mi.Vector2f, len(self.model))
+        dr.enable_grad(offset)
+        image = deferred.render(surfels, camera, filtered, offset)
+        maps = image.gbuffer.maps()
+        rendered = losses.display(image.color, maps.alpha, self.settings.background)
+        loss = losses.photometric(rendered, target, camera.size, w.dssim)
+        if w.mask > 0 and self.dataset.train[i].masked:
+            loss += w.mask * losses.mask(maps.alpha, alpha)
+        if w.consistency > 0:
+            loss += w.consistency * losses.depth_normal_consistency(image.gbuffer, camera)
+        if w.smoothness > 0:
+            loss += w.smoothness * losses.normal_smoothness(image.gbuffer)
+        error = dr.mean(dr.mean(dr.square(dr.detach(rendered) - target)))
+        dr.backward(loss * weight)
+        self.gradients.add(dr.grad(offset) / weight, image.gbuffer.seen, camera.size)
+        return error
+
+    def _next_views(self, count):
+        """Views of the next step: random orders of all, one after another, that depend on seed and position alone."""
+        n = len(self.dataset.train)
+        chosen = []
+        for k in range(self._position, self._position + count):
+            order = np.random.default_rng((self.settings.seed, k // n)).permutation(n)
+            chosen.append(int(order[k % n]))
+        self._position += count
+        return chosen
+
+    _position = 0
+
+    def _set_rates(self):
+        rate = {}
+        for name, field in _RATES.items():
+            first, last = getattr(self.settings.rates, field)
+            rate[name] = first * (last / first) ** self.progress
+        rate["centers"] *= self.extent
+        self.model.optimizer.set_learning_rate(rate)
+
+    def _control_density(self):
+        d = self.settings.density
+        if self.step_number % d.interval:
+            return
+        if d.start <= self.progress < d.stop:
+            densify(self.model, self.gradients, self.extent, d, np.random.default_rng((self.settings.seed, self.step_number)))
+        self.gradients = Gradients(len(self.model))

@@ -1,0 +1,132 @@
+"""Image losses and geometric regularisers, all on Dr.Jit arrays with a lane a pixel (row-major)."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .shading.deferred import COVERED
+from .splat.project import opaque
+
+SATURATED = 0.995  # display value from which a photograph only says "at least this bright"
+_WINDOW, _SIGMA = 11, 1.5  # SSIM's Gaussian window
+_C1, _C2 = 0.01**2, 0.03**2
+
+
+def srgb(x):
+    """The sRGB curve, continued above one; negative values count as zero."""
+    x = dr.maximum(x, 0)
+    return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * dr.power(dr.maximum(x, 0.0031308), 1 / 2.4) - 0.055)
+
+
+def display(color, alpha, background):
+    """Premultiplied linear ``color`` over ``background`` (a display-space grey level) in display space, as data sets with
+    straight alpha are composited: srgb(color / alpha) alpha + background (1 − alpha)."""
+    covered = alpha > COVERED
+    safe = dr.select(covered, alpha, 1)
+    return dr.select(covered, srgb(color / safe) * alpha, 0) + background * (1 - alpha)
+
+
+class _Blur(dr.CustomOp):
+    """SSIM's Gaussian window over a list of images, zero beyond their edges: symmetric, so it is its own adjoint."""
+
+    def eval(self, channels, size):
+        self.size = size
+        return self._apply(channels)
+
+    def forward(self):
+        self.set_grad_out(self._apply(self.grad_in("channels")))
+
+    def backward(self):
+        self.set_grad_in("channels", self._apply(self.grad_out()))
+
+    def _apply(self, channels):
+        width, height = self.size
+        offsets = np.arange(_WINDOW) - _WINDOW // 2
+        weights = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
+        weights /= weights.sum()
+        index = dr.arange(mi.UInt32, width * height)
+        x, y = mi.Int32(index % width), mi.Int32(index // width)
+        for position, extent, stride in ((x, width, 1), (y, height, width)):
+            dr.eval(channels)
+            out = [mi.Float(0)] * len(channels)
+            for offset, weight in zip(offsets.tolist(), weights.tolist()):
+                inside = (position + offset >= 0) & (position + offset < extent)
+                at = mi.UInt32(mi.Int32(index) + offset * stride)
+                out = [dr.fma(dr.gather(mi.Float, c, at, inside), weight, o) for c, o in zip(channels, out)]
+            channels = out
+        dr.eval(channels)
+        return channels
+
+    def name(self):
+        return "rgs_mi.losses.Blur"
+
+
+def ssim(image, target, size):
+    """Mean structural similarity of two ``mi.Color3f`` images (11 × 11 Gaussian window, σ 1.5), differentiable in the
+    first."""
+    with dr.suspend_grad():
+        blurred = dr.custom(_Blur, [*target, *(target * target)], size)
+    mu_y, yy = mi.Color3f(*blurred[:3]), mi.Color3f(*blurred[3:])
+    blurred = dr.custom(_Blur, [*image, *(image * image), *(image * target)], size)
+    mu_x, xx, xy = (mi.Color3f(*blurred[3 * k: 3 * k + 3]) for k in range(3))
+    var_x, var_y, cov = xx - mu_x * mu_x, yy - mu_y * mu_y, xy - mu_x * mu_y
+    value = ((2 * mu_x * mu_y + _C1) * (2 * cov + _C2)) / ((mu_x * mu_x + mu_y * mu_y + _C1) * (var_x + var_y + _C2))
+    return dr.mean(dr.mean(value))
+
+
+def photometric(image, target, size, dssim):
+    """(1 − λ) L1 + λ (1 − SSIM)/2 with λ = ``dssim`` (3DGS). Where the photograph is saturated a brighter rendering is no
+    error, and a too bright rendering elsewhere still feels its gradient."""
+    image = dr.select(target >= SATURATED, dr.minimum(image, target), image)
+    l1 = dr.mean(dr.mean(dr.abs(image - target)))
+    return (1 - dssim) * l1 + dssim * (1 - ssim(image, target, size)) / 2
+
+
+def mask(alpha, target):
+    """Mean absolute difference of coverage and mask."""
+    return dr.mean(dr.abs(alpha - target))
+
+
+def _interior(gbuffer):
+    """Numbers of the pixels that are covered together with their four neighbours."""
+    width, height = gbuffer.size
+    with dr.suspend_grad():
+        alpha = gbuffer.maps().alpha
+        index = dr.arange(mi.UInt32, width * height)
+        x, y = index % width, index // width
+        inner = (x > 0) & (y > 0) & (x + 1 < width) & (y + 1 < height)
+        for neighbour in (index, index - 1, index + 1, index - width, index + width):
+            inner &= dr.gather(mi.Float, alpha, neighbour, inner) > 0.5
+        return dr.compress(inner)
+
+
+def depth_normal_consistency(gbuffer, camera):
+    """2DGS's regulariser: mean of 1 − n·n_D over the image, with n the rendered normal and n_D that of the surface which
+    the rendered (expected) depth describes, by central differences."""
+    width, height = gbuffer.size
+    index = _interior(gbuffer)
+    if dr.width(index) == 0:
+        return mi.Float(0)
+    R, _, f, principal = opaque(camera)
+
+    def point(i):
+        m = gbuffer.maps(i)
+        z = m.depth / m.alpha
+        return mi.Vector3f((mi.Float(i % width) + 0.5 - principal.x) / f.x * z,
+                           (mi.Float(i // width) + 0.5 - principal.y) / f.y * z, z)
+
+    n_depth = dr.normalize(dr.cross(point(index + width) - point(index - width), point(index + 1) - point(index - 1)))
+    n = dr.normalize(R @ gbuffer.maps(index).normal)
+    return dr.sum(1 - dr.dot(n, n_depth)) / (width * height)
+
+
+def normal_smoothness(gbuffer):
+    """Mean over the covered pixels of the squared forward differences of N (RGS, L_normal, before its mask)."""
+    width, height = gbuffer.size
+    index = _interior(gbuffer)
+    if dr.width(index) == 0:
+        return mi.Float(0)
+    normal = lambda i: gbuffer.maps(i).normal
+    here = normal(index)
+    difference = dr.squared_norm(normal(index + 1) - here) + dr.squared_norm(normal(index + width) - here)
+    return dr.mean(difference)

@@ -1,0 +1,132 @@
+"""What a fit learns: surfels and environment in unconstrained form, and the optimiser that moves them."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .shading.environment import Environment
+from .surfel import Surfels
+
+#: Unconstrained parameters, a row a surfel. The last is the environment's.
+SURFEL_PARAMETERS = ("centers", "rotations", "log_scales", "logit_opacities", "sh_dc", "sh_rest", "logit_base_color",
+                     "logit_roughness", "logit_metallic", "delta_normal")
+ENVIRONMENT = "log_environment"
+#: The step of 3DGS's optimisers is relative to the gradient's own size, however small.
+_EPSILON = 1e-15
+
+
+def logit(p, margin=1e-4):
+    """Inverse of the logistic function, for NumPy arrays; ``p`` is kept ``margin`` away from 0 and 1."""
+    p = np.clip(p, margin, 1 - margin)
+    return np.log(p / (1 - p))
+
+
+def _sigmoid(x):
+    return 1 / (1 + dr.exp(-x))
+
+
+class Model:
+    """Surfels and environment as Adam sees them.
+
+    ``parameters``: NumPy arrays [N, channels] named as `SURFEL_PARAMETERS`, and `ENVIRONMENT` [rows, columns, 3], the
+    logarithm of radiance. ``rotation``: [3, 3] environment frame to world frame.
+    """
+
+    def __init__(self, parameters: dict, rotation: np.ndarray):
+        self.rotation = np.asarray(rotation, np.float64)
+        self.optimizer = mi.ad.Adam(lr=1e-3, epsilon=_EPSILON)
+        for name, value in parameters.items():
+            self.optimizer[name] = mi.TensorXf(np.ascontiguousarray(value, np.float32))
+
+    @classmethod
+    def start(cls, positions, normals, colors, spacing, environment, rotation, sh_order, seed=0, scale=1.0):
+        """Surfels at ``positions`` [N, 3], facing ``normals`` [N, 3] (None: random), of ``colors`` [N, 3] (linear), as wide
+        as ``scale`` times their ``spacing`` [N]; ``environment`` [rows, columns, 3] radiance to start from."""
+        from .surfel import rotation_from_normal
+
+        n, rng = len(positions), np.random.default_rng(seed)
+        if normals is None:
+            normals = rng.normal(size=(n, 3))
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return cls({
+            "centers": positions,
+            "rotations": rotation_from_normal(normals, rng.uniform(0, 2 * np.pi, n)),
+            "log_scales": np.log(scale * np.repeat(spacing[:, None], 2, 1)),
+            "logit_opacities": np.full((n, 1), logit(0.7)),
+            "sh_dc": (0.5 * colors - 0.5) / 0.28209479,
+            "sh_rest": np.zeros((n, 3 * ((sh_order + 1) ** 2 - 1))),
+            "logit_base_color": np.full((n, 3), logit(0.5)),
+            "logit_roughness": np.full((n, 1), logit(0.3)),
+            "logit_metallic": np.full((n, 1), logit(0.4)),
+            "delta_normal": np.zeros((n, 3)),
+            ENVIRONMENT: np.log(np.maximum(environment, 1e-3)),
+        }, rotation)
+
+    def __len__(self):
+        return self.optimizer["centers"].shape[0]
+
+    def __getitem__(self, name):
+        return self.optimizer[name]
+
+    def surfels(self, sh_order: int) -> Surfels:
+        """The surfels, with spherical harmonics up to ``sh_order``."""
+        p = self.optimizer
+        sh = p["sh_dc"]
+        if sh_order > 0:
+            sh = dr.concat((sh, p["sh_rest"][:, : 3 * ((sh_order + 1) ** 2 - 1)]), axis=1)
+        return Surfels(p["centers"], p["rotations"], dr.exp(p["log_scales"]), _sigmoid(p["logit_opacities"]), sh,
+                       _sigmoid(p["logit_base_color"]), _sigmoid(p["logit_roughness"]), _sigmoid(p["logit_metallic"]),
+                       p["delta_normal"])
+
+    def environment(self) -> Environment:
+        """The environment, non-negative by construction."""
+        return Environment(dr.exp(self.optimizer[ENVIRONMENT]), self.rotation)
+
+    # ---- Surgery ----
+
+    def numpy(self, name) -> np.ndarray:
+        """One parameter as a NumPy array."""
+        return dr.detach(self.optimizer[name]).numpy()
+
+    def set(self, name, value, reset=True):
+        """Replace a parameter; its moments start again from zero, or stay where ``reset`` is off (same shape)."""
+        moments = self.optimizer.state[name][3]
+        del self.optimizer[name]
+        self.optimizer[name] = mi.TensorXf(np.ascontiguousarray(value, np.float32))
+        if not reset:
+            self._set_moments(name, *moments[:3])
+
+    def select(self, index, changes):
+        """Keep the surfels ``index`` (any order, repeats allowed) with their moments, then overwrite parameters by
+        ``changes`` {name: array}. Surfels that ``fresh`` marks get zero moments."""
+        fresh = changes.pop("fresh", np.zeros(len(index), bool))
+        for name in SURFEL_PARAMETERS:
+            value = self.numpy(name)
+            t, m, v, _ = self.optimizer.state[name][3]
+            moments = [x.numpy().reshape(value.shape)[index] * ~fresh[:, None] for x in (m, v)]
+            self.set(name, changes.get(name, value[index]))
+            self._set_moments(name, t, *(mi.Float(x.ravel().astype(np.float32)) for x in moments))
+
+    def _set_moments(self, name, t, m, v):
+        value, promoted, lr, _ = self.optimizer.state[name]
+        self.optimizer.state[name] = value, promoted, lr, (t, m, v, None)
+
+    # ---- State ----
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything a checkpoint needs, as NumPy arrays."""
+        arrays = {"rotation": self.rotation}
+        for name in self.optimizer.keys():
+            t, m, v, _ = self.optimizer.state[name][3]
+            arrays |= {name: self.numpy(name), f"{name}.m": m.numpy(), f"{name}.v": v.numpy(),
+                       f"{name}.t": np.array(t).ravel()[0]}
+        return arrays
+
+    @classmethod
+    def from_state(cls, arrays: dict) -> "Model":
+        """The model that wrote ``state()``."""
+        names = [*SURFEL_PARAMETERS, ENVIRONMENT]
+        model = cls({name: arrays[name] for name in names}, arrays["rotation"])
+        for name in names:
+            model._set_moments(name, mi.UInt32(int(arrays[f"{name}.t"])), *(mi.Float(arrays[f"{name}.{k}"]) for k in "mv"))
+        return model

@@ -1,0 +1,86 @@
+"""How to fit: every number of the schedule, with defaults that suit two CPU cores. YAML files and --set change them."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+def _within(default, low, high):
+    return field(default=default, metadata={"min": low, "max": high})
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One level of the coarse-to-fine pyramid, used until that fraction of the fit is done."""
+
+    until: float = _within(1.0, 0, 1)
+    downscale: int = _within(1, 1, 64)  # of the photographs
+    views: int = _within(1, 1, 256)  # rendered per step; their losses are averaged (MVGS)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where the fit begins."""
+
+    surfels: int = _within(12_000, 1, 10_000_000)
+    environment_rows: int = _within(128, 8, 1024)  # the map has twice as many columns
+    environment_radiance: float = _within(0.5, 1e-3, 1e3)
+    scale: float = _within(0.8, 0.01, 10)  # standard deviation over the distance to the neighbours
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's learning rates; a pair is the first and the last, joined geometrically. Positions are in units of the object."""
+
+    centers: tuple[float, float] = (5e-4, 1e-5)
+    rotations: tuple[float, float] = (5e-3, 5e-4)
+    scales: tuple[float, float] = (1e-2, 2e-3)
+    opacities: tuple[float, float] = (5e-2, 1e-2)
+    sh_dc: tuple[float, float] = (1e-2, 1e-3)
+    sh_rest: tuple[float, float] = (1e-3, 1e-4)
+    base_color: tuple[float, float] = (2e-2, 4e-3)
+    roughness: tuple[float, float] = (2e-2, 4e-3)
+    metallic: tuple[float, float] = (2e-2, 4e-3)
+    delta_normal: tuple[float, float] = (1e-3, 1e-4)
+    environment: tuple[float, float] = (3e-2, 5e-3)
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights of the losses."""
+
+    dssim: float = _within(0.2, 0, 1)  # of D-SSIM against L1
+    mask: float = _within(0.1, 0, 1e3)
+    consistency: float = _within(0.05, 0, 1e3)  # depth-normal consistency (2DGS)
+    smoothness: float = _within(0.05, 0, 1e3)  # of rendered normals
+
+
+@dataclass(frozen=True)
+class Density:
+    """Adaptive density control (2DGS)."""
+
+    start: float = _within(0.08, 0, 1)  # fraction of the fit
+    stop: float = _within(0.6, 0, 1)
+    interval: int = _within(100, 1, 100_000)  # steps
+    threshold: float = _within(2e-4, 0, 1)  # positional gradient in NDC units
+    dense: float = _within(0.01, 0, 1)  # surfels smaller than this (in units of the object) are cloned, others split
+    prune_opacity: float = _within(0.05, 0, 1)
+    max_surfels: int = _within(40_000, 1, 10_000_000)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All of the above. Exactly one of ``minutes`` and ``iterations`` bounds the fit; `--minutes` sets the former."""
+
+    minutes: float | None = _within(8.0, 0.01, 100_000)
+    iterations: int | None = _within(None, 1, 10_000_000)
+    seed: int = _within(0, 0, 2**31)
+    background: float = _within(1.0, 0, 1)  # display grey level behind masked objects, in training and in figures
+    sh_order: int = _within(2, 0, 3)
+    sh_start: float = _within(0.4, 0, 1)  # fraction of the fit from which view-dependent diffuse is learned
+    specular: Literal["split_sum", "none"] = "split_sum"
+    checkpoint_seconds: float = _within(20, 0, 1e6)
+    stages: tuple[Stage, ...] = (Stage(0.2, 4, 4), Stage(0.5, 2, 2), Stage(1.0, 1, 1))
+    start: Start = Start()
+    rates: Rates = Rates()
+    weights: Weights = Weights()
+    density: Density = Density()
