@@ -1,6 +1,7 @@
 """The fit: views → render → loss → gradient → step → density, under a budget."""
 
 import time
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +12,7 @@ from .color import display
 from .density import Gradients, densify
 from .model import ENVIRONMENT, Model
 from .shading import deferred
+from .surfel import Surfels
 
 #: Rate of each parameter: the field of `Rates` that it obeys.
 _RATES = {"centers": "centers", "rotations": "rotations", "log_scales": "scales", "logit_opacities": "opacities",
@@ -89,14 +91,19 @@ class Fit:
         self._set_rates()
         views = self._next_views(stage.views)
         filtered = self.model.environment().filtered()
-        leaf = filtered.texels
-        errors = []
-        dr.enable_grad(*self.model.optimizer.values()) if False else None
         surfels = self.model.surfels(self.sh_order)
-        for i in views:
-            errors.append(self._view(i, surfels, filtered, 1 / len(views)))
+        # The views share what lies before them: their gradients meet in leaves there, and go the rest of the way once.
+        shared = [*vars(surfels).values(), filtered.texels]
+        leaves = [type(v)(dr.detach(v)) for v in shared]
+        dr.eval(leaves)
+        dr.enable_grad(leaves)
+        surfels, filtered = Surfels(*leaves[:-1]), replace(filtered, texels=leaves[-1])
+        errors = [self._view(i, surfels, filtered, 1 / len(views)) for i in views]
+        for value, leaf in zip(shared, leaves):
+            dr.set_grad(value, dr.grad(leaf))
+            dr.enqueue(dr.ADMode.Backward, value)
+        dr.traverse(dr.ADMode.Backward)
         self.model.optimizer.step()
-        dr.eval(*self.model.optimizer.values())
         self.psnr = -10 * np.log10(max(np.mean([float(e[0]) for e in errors]), 1e-10))
         self.step_number += 1
         self._control_density()

@@ -92,6 +92,7 @@ def _interior(gbuffer):
     width, height = gbuffer.size
     with dr.suspend_grad():
         alpha = gbuffer.maps().alpha
+        dr.eval(alpha)  # a gather from a packet that is not evaluated yet crashes (Dr.Jit 1.5.0)
         index = dr.arange(mi.UInt32, width * height)
         x, y = index % width, index // width
         inner = (x > 0) & (y > 0) & (x + 1 < width) & (y + 1 < height)
@@ -129,4 +130,4 @@ def normal_smoothness(gbuffer):
     normal = lambda i: gbuffer.maps(i).normal
     here = normal(index)
     difference = dr.squared_norm(normal(index + 1) - here) + dr.squared_norm(normal(index + width) - here)
-    return dr.mean(difference)
+    return dr.sum(difference) * dr.opaque(mi.Float, 1 / dr.width(index))  # a literal would recompile at every count
