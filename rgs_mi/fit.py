@@ -56,12 +56,27 @@ class Fit:
     sessions included.
     """
 
-    def __init__(self, dataset, model: Model, settings, extent: float, step=0, elapsed=0.0):
+    def __init__(self, dataset, model: Model, settings, extent: float):
         self.dataset, self.model, self.settings, self.extent = dataset, model, settings, extent
-        self.step_number, self.elapsed = step, elapsed
+        self.step_number, self.views_used, self.elapsed = 0, 0, 0.0
         self.gradients = Gradients(len(model))
         self.photographs = None
         self.psnr = float("nan")
+
+    def state(self) -> tuple[dict, dict]:
+        """(arrays, meta) for a checkpoint: with `resume` the fit goes on as if it had not been interrupted."""
+        arrays = self.model.state() | {"gradient_sum": self.gradients.sum.numpy(),
+                                       "gradient_count": self.gradients.count.numpy()}
+        return arrays, {"step": self.step_number, "views_used": self.views_used, "elapsed": self.elapsed,
+                        "extent": self.extent}
+
+    @classmethod
+    def resume(cls, dataset, settings, arrays: dict, meta: dict) -> "Fit":
+        """The fit whose `state` this was."""
+        fit = cls(dataset, Model.from_state(arrays), settings, meta["extent"])
+        fit.step_number, fit.views_used, fit.elapsed = meta["step"], meta["views_used"], meta["elapsed"]
+        fit.gradients.sum, fit.gradients.count = (mi.Float(arrays[f"gradient_{k}"]) for k in ("sum", "count"))
+        return fit
 
     @property
     def progress(self) -> float:
@@ -134,13 +149,11 @@ class Fit:
         """Views of the next step: random orders of all, one after another, that depend on seed and position alone."""
         n = len(self.dataset.train)
         chosen = []
-        for k in range(self._position, self._position + count):
+        for k in range(self.views_used, self.views_used + count):
             order = np.random.default_rng((self.settings.seed, k // n)).permutation(n)
             chosen.append(int(order[k % n]))
-        self._position += count
+        self.views_used += count
         return chosen
-
-    _position = 0
 
     def _set_rates(self):
         rate = {}
