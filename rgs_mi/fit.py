@@ -12,7 +12,7 @@ from .color import display
 from .density import Gradients, densify
 from .model import ENVIRONMENT, Model
 from .shading import deferred
-from .surfel import Surfels
+from .surfel import CHANNELS, Surfels
 
 #: Rate of each parameter: the field of `Rates` that it obeys.
 _RATES = {"centers": "centers", "rotations": "rotations", "log_scales": "scales", "logit_opacities": "opacities",
@@ -108,11 +108,11 @@ class Fit:
         filtered = self.model.environment().filtered()
         surfels = self.model.surfels(self.sh_order)
         # The views share what lies before them: their gradients meet in leaves there, and go the rest of the way once.
-        shared = [*vars(surfels).values(), filtered.texels]
+        shared = [*(getattr(surfels, name) for name in CHANNELS), filtered.texels]
         leaves = [type(v)(dr.detach(v)) for v in shared]
         dr.eval(leaves)
         dr.enable_grad(leaves)
-        surfels, filtered = Surfels(*leaves[:-1]), replace(filtered, texels=leaves[-1])
+        surfels, filtered = Surfels(*leaves[:-1], surfels.two_sided), replace(filtered, texels=leaves[-1])
         errors = [self._view(i, surfels, filtered, 1 / len(views)) for i in views]
         for value, leaf in zip(shared, leaves):
             dr.set_grad(value, dr.grad(leaf))

@@ -29,18 +29,18 @@ class Model:
     """Surfels and environment as Adam sees them.
 
     ``parameters``: NumPy arrays [N, channels] named as `SURFEL_PARAMETERS`, and `ENVIRONMENT` [rows, columns, 3], the
-    logarithm of radiance. ``rotation``: [3, 3] environment frame to world frame.
+    logarithm of radiance. ``rotation``: [3, 3] environment frame to world frame. ``two_sided``: see `Surfels`.
     """
 
-    def __init__(self, parameters: dict, rotation: np.ndarray):
-        self.rotation = np.asarray(rotation, np.float64)
+    def __init__(self, parameters: dict, rotation: np.ndarray, two_sided: bool = True):
+        self.rotation, self.two_sided = np.asarray(rotation, np.float64), bool(two_sided)
         self.optimizer = mi.ad.Adam(lr=1e-3, epsilon=_EPSILON)
         for name, value in parameters.items():
             self.optimizer[name] = mi.TensorXf(np.ascontiguousarray(value, np.float32))
 
     @classmethod
     def start(cls, positions, normals, colors, spacing, environment, rotation, sh_order, seed=0, scale=1.0):
-        """Surfels at ``positions`` [N, 3], facing ``normals`` [N, 3] (None: random), of ``colors`` [N, 3] (linear), as wide
+        """Surfels at ``positions`` [N, 3], facing ``normals`` [N, 3] (outward, one-sided; None: random, two-sided), of ``colors`` [N, 3] (linear), as wide
         as ``scale`` times their ``spacing`` [N]; ``environment`` [rows, columns, 3] radiance to start from."""
         from .surfel import rotation_from_normal
 
@@ -60,7 +60,7 @@ class Model:
             "logit_metallic": np.full((n, 1), logit(0.4)),
             "delta_normal": np.zeros((n, 3)),
             ENVIRONMENT: np.log(np.maximum(environment, 1e-3)),
-        }, rotation)
+        }, rotation, two_sided=normals is None)
 
     def __len__(self):
         return self.optimizer["centers"].shape[0]
@@ -76,7 +76,7 @@ class Model:
             sh = dr.concat((sh, p["sh_rest"][:, : 3 * ((sh_order + 1) ** 2 - 1)]), axis=1)
         return Surfels(p["centers"], p["rotations"], dr.exp(p["log_scales"]), _sigmoid(p["logit_opacities"]), sh,
                        _sigmoid(p["logit_base_color"]), _sigmoid(p["logit_roughness"]), _sigmoid(p["logit_metallic"]),
-                       p["delta_normal"])
+                       p["delta_normal"], self.two_sided)
 
     def environment(self) -> Environment:
         """The environment, non-negative by construction."""
@@ -115,7 +115,7 @@ class Model:
 
     def state(self) -> dict[str, np.ndarray]:
         """Everything a checkpoint needs, as NumPy arrays."""
-        arrays = {"rotation": self.rotation}
+        arrays = {"rotation": self.rotation, "two_sided": np.array(self.two_sided)}
         for name in self.optimizer.keys():
             t, m, v, _ = self.optimizer.state[name][3]
             arrays |= {name: self.numpy(name), f"{name}.m": m.numpy(), f"{name}.v": v.numpy(),
@@ -126,7 +126,7 @@ class Model:
     def from_state(cls, arrays: dict) -> "Model":
         """The model that wrote ``state()``."""
         names = [*SURFEL_PARAMETERS, ENVIRONMENT]
-        model = cls({name: arrays[name] for name in names}, arrays["rotation"])
+        model = cls({name: arrays[name] for name in names}, arrays["rotation"], arrays["two_sided"])
         for name in names:
             model._set_moments(name, mi.UInt32(int(arrays[f"{name}.t"])), *(mi.Float(arrays[f"{name}.{k}"]) for k in "mv"))
         return model

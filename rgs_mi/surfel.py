@@ -4,7 +4,7 @@ A surfel is the 2DGS primitive: a centre, two tangents with a standard deviation
 names of Mitsuba's principled BSDF, so that a cloud of surfels is a principled material (`method.md` §1).
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -26,6 +26,8 @@ class Surfels:
       sh            diffuse radiance, linear: max(0, 1/2 + sum_k sh_k Y_k(d)), d from the camera to the centre (3DGS)
       base_color, roughness, metallic   principled BSDF parameters in [0, 1]
       delta_normal  the residual Δn that is added to the normal (RGS, eq. of N)
+      two_sided     whether surfels show from behind, with the normal turned to the camera (2DGS); one-sided ones, whose
+                    normals point outwards, keep the far side of a closed object from bending its silhouette's normals
     """
 
     centers: "mi.TensorXf"
@@ -37,18 +39,20 @@ class Surfels:
     roughness: "mi.TensorXf"
     metallic: "mi.TensorXf"
     delta_normal: "mi.TensorXf"
+    two_sided: bool = True
 
     def __len__(self):
         return self.centers.shape[0]
 
     @classmethod
-    def from_numpy(cls, arrays: dict) -> "Surfels":
+    def from_numpy(cls, arrays: dict, two_sided=True) -> "Surfels":
         """From float32 arrays, one a field."""
-        return cls(**{name: mi.TensorXf(np.ascontiguousarray(arrays[name], np.float32)) for name in CHANNELS})
+        return cls(**{name: mi.TensorXf(np.ascontiguousarray(arrays[name], np.float32)) for name in CHANNELS},
+                   two_sided=two_sided)
 
     def numpy(self) -> dict[str, np.ndarray]:
         """One float32 array a field, detached."""
-        return {f.name: dr.detach(getattr(self, f.name)).numpy() for f in fields(self)}
+        return {name: dr.detach(getattr(self, name)).numpy() for name in CHANNELS}
 
     def column(self, kind, name):
         """Field ``name`` as a Dr.Jit array with one lane a surfel, e.g. ``column(mi.Point3f, "centers")``."""

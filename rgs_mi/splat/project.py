@@ -24,7 +24,8 @@ EDGE_ON = 1e-3  # least |cosine| between a surfel's normal and the ray to its ce
 @dataclass
 class Projected:
     """``geometry``: the ten numbers of (1), ``mi.Float`` of width N each; ``view``: unit directions from the camera to the
-    centres, world space; ``normal``: unit normals turned towards the camera, world space; ``visible``: in front of it."""
+    centres, world space; ``normal``: unit normals turned towards the camera, world space; ``visible``: in front of it,
+    and turned to it where surfels are one-sided."""
 
     geometry: list
     view: "mi.Vector3f"
@@ -64,6 +65,8 @@ def project(surfels, camera, screen_offset=None) -> Projected:
 
     distance = dr.norm(offset)
     facing = dr.dot(p, n)
+    if not surfels.two_sided:
+        visible &= facing < 0
     least = EDGE_ON * dr.detach(distance)
     facing_safe = dr.select(dr.abs(facing) < least, dr.copysign(least, facing), facing)
     N = mi.Vector2f(n.x / f.x, n.y / f.y) * (z / facing_safe)
