@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..errors import UserError
 from . import prefilter as _prefilter
 
 
@@ -30,11 +31,19 @@ class Environment:
 
     @classmethod
     def from_emitter(cls, emitter) -> "Environment":
-        """From a Mitsuba `envmap`; gradients of its ``data`` and ``scale`` are kept."""
+        """From a Mitsuba `envmap` (gradients of its ``data`` and ``scale`` are kept) or `constant` emitter (of its
+        ``radiance``), which becomes a small map.
+
+        Raises: UserError for another kind of emitter.
+        """
         params = mi.traverse(emitter)
-        data = params["data"]
-        rows, padded, _ = data.shape
-        texels = data[:, 1:padded - 1, :] * params["scale"]
+        if emitter.class_name() == "ConstantBackgroundEmitter" and "radiance.value" in params:
+            radiance = mi.Color3f(params["radiance.value"])
+            return cls(dr.zeros(mi.TensorXf, (8, 16, 3)) + mi.TensorXf(dr.ravel(radiance), (1, 1, 3)), np.eye(3))
+        if emitter.class_name() != "EnvironmentMapEmitter":
+            raise UserError(f"emitter '{emitter.id()}' is a {emitter.class_name()}: "
+                            "surfels need an 'envmap' or 'constant'")
+        texels = params["data"][:, 1:-1, :] * params["scale"]
         rotation = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)[:3, :3]
         return cls(texels, rotation)
 

@@ -7,8 +7,8 @@ small real matrix per longitudinal frequency m:
     P̂_m = M_m L̂_m,   M_m[i, j] = ∫∫ K(γ(θ_i, θ, Δφ)) hat_j(θ) sinθ cos(mΔφ) dθ dΔφ · sinc²           (5)
 
 with K the principled BSDF's lobe (`tables.lobe`), γ the angle between the directions, and hats because Mitsuba's
-`envmap` interpolates bilinearly. Rows are normalised: a constant environment stays constant. Nothing is truncated, the
-poles are exact, and the adjoint is the transpose of (5).
+`envmap` interpolates bilinearly. Rows are normalised: a constant environment stays constant. The poles are
+exact, and the adjoint is the transpose of (5).
 """
 
 import functools
@@ -23,29 +23,32 @@ from .tables import lobe
 
 #: Roughness of each level and the rows of its map; None: the environment's own. Level 0 is the mirror: no filter.
 LEVELS = ((0.0, None), (0.1, None), (0.2, None), (0.3, 64), (0.4, 64), (0.55, 32), (0.7, 32), (0.85, 16), (1.0, 16))
-_FINE_ROWS = 4  # quadrature nodes per row of texels
+_NEGLIGIBLE = 1e-5  # rows where the lobe is below this part of its peak are left out
+_NODES_PER_LOBE = 2  # quadrature nodes per GGX width α = roughness² of a lobe
 
 
 def _kernel_matrix(roughness, rows, columns, out_rows):
     """[M, out_rows, rows] of (5), M = frequencies of the output."""
     frequencies = min(columns, 2 * out_rows) // 2 + 1
-    fine = (rows - 1) * _FINE_ROWS + 1
+    nodes = max(2, int(np.ceil(np.pi / (rows - 1) / roughness**2 * _NODES_PER_LOBE)))  # per texel, in both directions
+    fine = (rows - 1) * nodes + 1
     theta = np.linspace(0, np.pi, fine)
-    samples = columns * 2
+    samples = columns * nodes
     delta = 2 * np.pi * np.arange(samples // 2 + 1) / samples  # the kernel is even in Δφ
     # the lobe against its angle, dense where it is narrow
     angles = np.pi / 2 * np.linspace(0, 1, 4096) ** 2
     table = lobe(roughness, angles)
-    hat = np.maximum(0, 1 - np.abs(np.arange(fine)[:, None] / _FINE_ROWS - np.arange(rows)))  # [fine, rows]
+    hat = np.maximum(0, 1 - np.abs(np.arange(fine)[:, None] / nodes - np.arange(rows)))  # [fine, rows]
     hat *= np.sin(theta)[:, None]
     theta_out = np.linspace(0, np.pi, out_rows)
     matrix = np.empty((frequencies, out_rows, rows), np.float32)
+    reach = angles[np.flatnonzero(table > _NEGLIGIBLE * table[0])[-1]]
     for i, t in enumerate(theta_out):
-        cosine = np.cos(t) * np.cos(theta)[:, None] + np.sin(t) * np.sin(theta)[:, None] * np.cos(delta)
-        gamma = np.arccos(np.clip(cosine, -1, 1))
-        kernel = np.interp(gamma, angles, table, right=0.0)
-        spectrum = fft.dct(kernel, type=1, axis=1)[:, :frequencies]  # cosine series of an even function
-        matrix[:, i] = spectrum.T @ hat
+        near = np.flatnonzero(np.abs(theta - t) <= reach)
+        cosine = np.cos(t) * np.cos(theta[near, None]) + np.sin(t) * np.sin(theta[near, None]) * np.cos(delta)
+        kernel = np.interp(np.arccos(np.clip(cosine, -1, 1)).astype(np.float32), angles, table, right=0.0)
+        spectrum = fft.dct(kernel.astype(np.float32), type=1, axis=1)[:, :frequencies]  # cosine series: K is even in Δφ
+        matrix[:, i] = spectrum.T @ hat[near]
     matrix *= (np.sinc(np.arange(frequencies) / columns) ** 2)[:, None, None]
     return matrix / matrix[0].sum(1)[None, :, None]
 

@@ -17,7 +17,7 @@ import numpy as np
 
 COSINES = 48
 ROUGHNESSES = 32
-_SIDE = 48  # stratified samples along each dimension
+_SIDE = 96  # stratified samples along each dimension
 MIN_ROUGHNESS = 0.032  # the principled BSDF clamps its GGX width α = roughness² at 0.001
 
 
@@ -52,7 +52,10 @@ def albedo_table(eta: float, variant: str) -> np.ndarray:
     wi = mi.Vector3f(mi.Float(np.sqrt(1 - mu**2)), 0, mi.Float(mu))
     n = _SIDE * _SIDE
     k = dr.arange(mi.UInt32, len(mu) * n)
-    sample = mi.Point2f(mi.Float(k % _SIDE) + 0.5, mi.Float((k // _SIDE) % _SIDE) + 0.5) / _SIDE
+    jitter = mi.PCG32(size=len(mu) * n)
+    sample = mi.Point2f(mi.Float(k % _SIDE) + jitter.next_float32(),
+                        mi.Float((k // _SIDE) % _SIDE) + jitter.next_float32()) / _SIDE
+    dr.eval(sample)
     wi = dr.gather(mi.Vector3f, wi, k // n)
     si = interaction(wi)
     table = np.zeros((COSINES, ROUGHNESSES, 3), np.float32)

@@ -1,0 +1,95 @@
+"""Density control: who is cloned, split and pruned, and that the optimiser's moments follow."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from rgs_mi.density import Gradients, densify
+from rgs_mi.model import ENVIRONMENT, SURFEL_PARAMETERS, Model, logit
+from rgs_mi.settings import Density
+
+N = 12
+
+
+def model():
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(N, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    m = Model.start(normals, normals, rng.uniform(0, 1, (N, 3)), np.full(N, 0.005), np.full((8, 16, 3), 0.5), np.eye(3), 2)
+    for name in m.optimizer.keys():  # moments that tell the surfels apart
+        dr.set_grad(m.optimizer[name], mi.TensorXf(np.broadcast_to(
+            np.arange(1, 1 + m[name].shape[0], dtype=np.float32).reshape(-1, *[1] * (m[name].ndim - 1)), m[name].shape).copy()))
+    m.optimizer.set_learning_rate({name: 1e-6 for name in m.optimizer.keys()})
+    m.optimizer.step()
+    return m
+
+
+def gradients(values, seen=None):
+    g = Gradients(N)
+    g.sum, g.count = mi.Float(np.asarray(values, np.float32)), mi.Float(np.ones(N, np.float32) if seen is None else seen)
+    return g
+
+
+def moment(m, name):
+    return m.optimizer.state[name][3][1].numpy().reshape(len(m), -1)[:, 0]
+
+
+def test_small_surfels_are_cloned_and_moments_follow():
+    m = model()
+    before = {name: m.numpy(name) for name in SURFEL_PARAMETERS}
+    hot = np.zeros(N)
+    hot[[2, 7]] = 1.0
+    old = moment(m, "centers")
+    densify(m, gradients(hot), 1.0, Density(), np.random.default_rng(0))
+    assert len(m) == N + 2
+    assert np.allclose(moment(m, "centers"), [*old, 0, 0])
+    assert np.allclose(m.numpy("centers")[N:], before["centers"][[2, 7]])
+    # both twins together cover what the parent did
+    o = 1 / (1 + np.exp(-m.numpy("logit_opacities")[[2, N], 0]))
+    parent = 1 / (1 + np.exp(-before["logit_opacities"][2, 0]))
+    assert 1 - np.prod(1 - o) == pytest.approx(parent, abs=1e-4)
+
+
+def test_large_surfels_are_split_in_their_plane():
+    m = model()
+    scales = m.numpy("log_scales")
+    scales[3] = np.log(0.1)
+    m.set("log_scales", scales)
+    normal = m.numpy("centers")[3]
+    hot = np.zeros(N)
+    hot[3] = 1.0
+    densify(m, gradients(hot), 1.0, Density(), np.random.default_rng(0))
+    assert len(m) == N + 1
+    halves = m.numpy("centers")[[3, N]]
+    assert np.allclose(np.exp(m.numpy("log_scales")[[3, N]]), 0.1 / 1.6, rtol=1e-4)
+    assert np.abs((halves - normal) @ normal).max() < 1e-3 and np.linalg.norm(halves[0] - halves[1]) > 1e-3
+
+
+def test_transparent_unseen_and_huge_surfels_go():
+    m = model()
+    opacity, scales, seen = m.numpy("logit_opacities"), m.numpy("log_scales"), np.ones(N, np.float32)
+    opacity[0], scales[1], seen[2] = logit(0.01), np.log(0.9), 0
+    m.set("logit_opacities", opacity)
+    m.set("log_scales", scales)
+    centers = m.numpy("centers")
+    densify(m, gradients(np.zeros(N), seen), 1.0, Density(), np.random.default_rng(0))
+    assert np.allclose(m.numpy("centers"), centers[3:])
+
+
+def test_budget_goes_to_the_largest_gradients():
+    m = model()
+    centers = m.numpy("centers")
+    densify(m, gradients(np.arange(N)), 1.0, Density(max_surfels=N + 3), np.random.default_rng(0))
+    assert len(m) == N + 3
+    assert {tuple(c) for c in m.numpy("centers")[N:].round(5)} == {tuple(c) for c in centers[-3:].round(5)}
+
+
+def test_state_round_trip():
+    m = model()
+    again = Model.from_state(m.state())
+    for name in [*SURFEL_PARAMETERS, ENVIRONMENT]:
+        assert np.array_equal(m.numpy(name), again.numpy(name))
+        for a, b in zip(m.optimizer.state[name][3][:3], again.optimizer.state[name][3][:3]):
+            assert np.array_equal(np.array(a).ravel(), np.array(b).ravel())
+    assert not again.two_sided

@@ -1,0 +1,88 @@
+"""Losses against NumPy twins, and their gradients against finite differences."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scenes import orbit_camera, sphere_surfels
+from scipy import ndimage
+
+from rgs_mi import losses
+from rgs_mi.color import srgb_encode
+from rgs_mi.splat.gbuffer import render_gbuffer
+
+SIZE = (23, 17)  # width, height
+
+
+def images(seed):
+    rng = np.random.default_rng(seed)
+    return [rng.uniform(0, 0.9, (SIZE[1], SIZE[0], 3)).astype(np.float32) for _ in range(2)]
+
+
+def lanes(image):
+    return mi.Color3f(np.ascontiguousarray(image.reshape(-1, 3).T))
+
+
+def ssim_twin(x, y):
+    kernel = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+    kernel /= kernel.sum()
+    blur = lambda v: ndimage.correlate1d(ndimage.correlate1d(v, kernel, 0, mode="constant"), kernel, 1, mode="constant")
+    mx, my = blur(x), blur(y)
+    vx, vy, c = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+    return (((2 * mx * my + 1e-4) * (2 * c + 9e-4)) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))).mean()
+
+
+def test_ssim_equals_its_twin():
+    x, y = images(0)
+    assert losses.ssim(lanes(x), lanes(y), SIZE)[0] == pytest.approx(ssim_twin(x.astype(float), y.astype(float)), abs=1e-5)
+    assert losses.ssim(lanes(x), lanes(x), SIZE)[0] == pytest.approx(1, abs=1e-5)
+
+
+def test_photometric_gradient():
+    x, y = images(1)
+    direction = np.random.default_rng(2).normal(size=x.shape)
+    image = lanes(x)
+    dr.enable_grad(image)
+    dr.backward(losses.photometric(image, lanes(y), SIZE, 0.3))
+    gradient = dr.grad(image).numpy().T.reshape(x.shape).astype(np.float64)
+    value = lambda h: (lambda z: 0.7 * np.abs(z - y).mean() + 0.15 * (1 - ssim_twin(z, y.astype(float))))(x + h * direction)
+    assert (gradient * direction).sum() == pytest.approx((value(1e-5) - value(-1e-5)) / 2e-5, rel=2e-3)
+
+
+def test_saturated_photographs_accept_anything_brighter():
+    x, y = images(3)
+    y[:, :5], x[:, :5] = 1.0, 3.0  # a highlight that the photograph clips
+    x[:, 5:10] = 1.4  # too bright where the photograph is not clipped: must be felt
+    image = lanes(x)
+    dr.enable_grad(image)
+    dr.backward(losses.photometric(image, lanes(y), SIZE, 0.0))
+    gradient = dr.grad(image).numpy().T.reshape(x.shape)
+    assert np.all(gradient[:, :5] == 0) and np.all(gradient[:, 5:10] > 0)
+
+
+def test_display_is_the_srgb_curve_of_the_straight_colour():
+    color, alpha = np.array([0.0, 0.001, 0.2, 0.5]), np.array([1.0, 1.0, 0.5, 0.0])
+    value = losses.display(mi.Color3f(mi.Float(color)), mi.Float(alpha), 1.0).numpy()[0]
+    assert np.allclose(value, [0, srgb_encode(0.001), srgb_encode(0.4) * 0.5 + 0.5, 1], atol=1e-5)
+
+
+def test_depth_normals_agree_on_a_smooth_surface():
+    """A densely covered sphere: depth normals are its normals, whichever way the camera turns."""
+    surfels = sphere_surfels(4000, scale=1.0, opacity_shift=3)
+    from rgs_mi.surfel import Surfels, rotation_from_normal
+    arrays = surfels.numpy()
+    arrays["rotations"], arrays["delta_normal"] = rotation_from_normal(arrays["centers"]), 0 * arrays["delta_normal"]
+    camera = orbit_camera(size=(96, 96))
+    good = losses.depth_normal_consistency(render_gbuffer(Surfels.from_numpy(arrays, two_sided=False), camera), camera)[0]
+    tilted = arrays | {"delta_normal": np.full((4000, 3), 0.7, np.float32)}
+    bad = losses.depth_normal_consistency(render_gbuffer(Surfels.from_numpy(tilted, two_sided=False), camera), camera)[0]
+    assert 0 <= good < 0.01 < bad
+
+
+def test_nothing_covered_costs_nothing():
+    surfels, camera = sphere_surfels(5), orbit_camera(size=(32, 32))
+    arrays = surfels.numpy()
+    arrays["centers"] = arrays["centers"] + 100
+    from rgs_mi.surfel import Surfels
+    gbuffer = render_gbuffer(Surfels.from_numpy(arrays), camera)
+    assert losses.depth_normal_consistency(gbuffer, camera)[0] == 0 and losses.normal_smoothness(gbuffer)[0] == 0

@@ -1,0 +1,119 @@
+"""Tables, prefilter and split-sum against independent integrals of Mitsuba's principled BSDF."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scenes import orbit_camera, sphere_surfels
+
+from rgs_mi.shading import deferred, prefilter, split_sum, tables
+from rgs_mi.shading.environment import Environment
+from rgs_mi.surfel import CHANNELS, Surfels
+
+
+
+def unit(rng, n):
+    d = rng.normal(size=(n, 3))
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def vector(array):
+    return mi.Vector3f(np.ascontiguousarray(np.asarray(array, np.float32).T))
+
+
+@pytest.mark.parametrize("roughness", [0.3, 0.5, 0.8])
+@pytest.mark.parametrize("cosine", [0.15, 0.6, 1.0])
+@pytest.mark.parametrize("metallic, base_color", [(0.0, 0.0), (1.0, 0.0), (1.0, 0.7)])
+def test_albedo_equals_bsdf_sampling(roughness, cosine, metallic, base_color):
+    """The table against the BSDF's own sampling routine, by its standard error."""
+    n = 1 << 18
+    bsdf = tables.principled(roughness, metallic, base_color, 1.5)
+    wi = mi.Vector3f(float(np.sqrt(1 - cosine**2)), 0, cosine) + dr.zeros(mi.Vector3f, n)
+    rng = mi.PCG32(size=n)
+    sample, weight = bsdf.sample(mi.BSDFContext(), tables.interaction(wi), rng.next_float32(),
+                                 mi.Point2f(rng.next_float32(), rng.next_float32()))
+    weight = dr.select(sample.pdf > 0, weight.x, 0).numpy()
+    one = lambda v: mi.Float(v)
+    mine = split_sum.albedo(one(cosine), one(roughness), one(metallic), mi.Color3f(base_color)).x[0]
+    error = weight.std() / np.sqrt(n)
+    assert abs(mine - weight.mean()) < 4 * error + 0.004  # and what bilinear interpolation of the table may cost
+
+
+def test_prefilter_is_the_lobe_integral():
+    """Against a direct quadrature over the sphere, without Fourier space, at every level."""
+    rng = np.random.default_rng(0)
+    rows, columns = 16, 32
+    texels = rng.uniform(0, 1, (rows, columns, 3)).astype(np.float32) ** 3
+    operator = prefilter.prefilter(rows, columns, mi.variant())
+    levels = np.split(operator.apply(texels), operator.offsets[1:].astype(int))
+    fine = 40
+    theta = (np.arange(rows * fine * 2) + 0.5) / (rows * fine * 2) * np.pi
+    phi = (np.arange(columns * fine) + 0.5) / (columns * fine) * 2 * np.pi
+    t, p = np.meshgrid(theta, phi, indexing="ij")
+    d = np.stack([np.sin(t) * np.sin(p), np.cos(t), -np.sin(t) * np.cos(p)], -1).reshape(-1, 3)
+    environment = Environment(mi.TensorXf(texels), np.eye(3)).filtered()
+    radiance = environment.eval(vector(d)).numpy().T
+    weight = np.sin(t).ravel()
+    for (roughness, _), (r, c), level in zip(prefilter.LEVELS[1:], operator.maps[1:], levels[1:]):
+        for i, j in [(0, 0), (r // 3, c // 2), (r // 2, 1), (r - 2, c - 1)]:
+            a, b = np.pi * i / (r - 1), 2 * np.pi * (j + 0.5) / c
+            axis = np.array([np.sin(a) * np.sin(b), np.cos(a), -np.sin(a) * np.cos(b)])
+            angle = np.arccos(np.clip(d @ axis, -1, 1))
+            kernel = np.where(angle < np.pi / 2, tables.lobe(roughness, np.minimum(angle, np.pi / 2)), 0) * weight
+            if kernel.max() / kernel.sum() > 2e-3:
+                continue  # the quadrature, not the filter, is too coarse for this lobe
+            expected = (kernel[:, None] * radiance).sum(0) / kernel.sum()
+            assert np.allclose(level.reshape(r, c, 3)[i, j], expected, atol=0.01), (roughness, i, j)
+
+
+@pytest.mark.parametrize("rows", [16, 33, 64])
+def test_prefilter_transpose_and_constants(rows):
+    rng = np.random.default_rng(rows)
+    operator = prefilter.prefilter(rows, 2 * rows, mi.variant())
+    x = rng.normal(size=(rows, 2 * rows, 3)).astype(np.float32)
+    y = rng.normal(size=(operator.texels, 3)).astype(np.float32)
+    forward, backward = (y.astype(np.float64) * operator.apply(x)).sum(), (x.astype(np.float64) * operator.transpose(y)).sum()
+    assert forward == pytest.approx(backward, rel=1e-4, abs=1e-3)
+    assert np.allclose(operator.apply(np.full_like(x, 2.5)), 2.5, atol=1e-4)
+
+
+def test_environment_equals_the_envmap_emitter():
+    """Orientation and interpolation, the seam included, for a map that is turned. (At the very poles any longitude is
+    right, and the texels of a pole's row differ.)"""
+    rng = np.random.default_rng(1)
+    texels = rng.uniform(0, 1, (16, 32, 3)).astype(np.float32)
+    emitter = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(texels), "scale": 1.5,
+                            "to_world": mi.ScalarTransform4f().rotate([0.6, 0.8, 0], 90).rotate([0, 1, 0], 40)})
+    environment = Environment.from_emitter(emitter)
+    d = vector(np.concatenate([unit(rng, 4000), environment.rotation.T[[0, 2]], -environment.rotation.T[[0, 2]]]))
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(d))
+    si.wi = -d
+    assert np.allclose(environment.filtered().eval(d).numpy(), emitter.eval(si).numpy(), atol=2e-4)
+
+
+def test_gradients_equal_finite_differences():
+    """Of the shaded image in the environment and every field, in random directions."""
+    rng = np.random.default_rng(2)
+    surfels, camera = sphere_surfels(60, seed=4, scale=1.0, opacity_shift=3.0), orbit_camera(size=(20, 20))
+    base = surfels.numpy() | {"texels": (rng.uniform(0.2, 1, (16, 32, 3))).astype(np.float32)}
+    weights = rng.normal(size=(3, 400)).astype(np.float32)
+
+    def render(arrays):
+        surfels = Surfels.from_numpy(arrays)
+        texels = mi.TensorXf(arrays["texels"])
+        for value in [*(getattr(surfels, n) for n in CHANNELS), texels]:
+            dr.enable_grad(value)
+        image = deferred.render(surfels, camera, Environment(texels, np.eye(3)).filtered())
+        return image, surfels, texels
+
+    image, surfels, texels = render(base)
+    dr.backward(sum(dr.sum(c * mi.Float(w)) for c, w in zip(image.color, weights)))
+    for name in ("texels", "base_color", "roughness", "metallic", "delta_normal", "sh"):
+        gradient = dr.grad(texels if name == "texels" else getattr(surfels, name)).numpy().astype(np.float64)
+        direction = rng.normal(size=gradient.shape) * np.abs(base[name]).mean()
+        value = lambda h: (render(base | {name: base[name] + h * direction})[0].color.numpy().astype(np.float64) * weights).sum()
+        central = lambda h: (value(h) - value(-h)) / (2 * h)
+        expected = (4 * central(1e-3) - central(2e-3)) / 3
+        size = np.linalg.norm(gradient) * np.linalg.norm(direction)
+        # texel boundaries and level changes are kinks, so a few pixels in a thousand add an error of their own
+        assert abs((gradient * direction).sum() - expected) < 1e-3 * max(abs(expected), size), name
