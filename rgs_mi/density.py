@@ -29,11 +29,11 @@ class Gradients:
         return self.sum.numpy() / np.maximum(self.count.numpy(), 1)
 
 
-def densify(model, gradients: Gradients, extent: float, settings, rng) -> None:
+def densify(model, gradients: Gradients, extent: float, settings, rng, budget: int) -> None:
     """One round of density control, in place. ``extent``: radius of the object in world units; ``settings``: `Density`.
 
     Surfels whose mean gradient exceeds the threshold are cloned when small and split when large, the largest gradients
-    first while ``max_surfels`` lasts. Transparent, unseen and huge ones go.
+    first while ``budget`` (surfels in all) lasts. Transparent, unseen and huge ones go.
     """
     gradient, seen = gradients.mean(), gradients.count.numpy() > 0
     opacity = 1 / (1 + np.exp(-model.numpy("logit_opacities")[:, 0]))
@@ -44,7 +44,7 @@ def densify(model, gradients: Gradients, extent: float, settings, rng) -> None:
         return
 
     hot = np.flatnonzero(keep & (gradient > settings.threshold))
-    room = max(0, settings.max_surfels - int(keep.sum()))
+    room = max(0, budget - int(keep.sum()))
     hot = hot[np.argsort(-gradient[hot], kind="stable")][:room]
     split = hot[largest[hot] > settings.dense * extent]
     clone = hot[largest[hot] <= settings.dense * extent]

@@ -168,5 +168,9 @@ class Fit:
         if self.step_number % d.interval:
             return
         if d.start <= self.progress < d.stop:
-            densify(self.model, self.gradients, self.extent, d, np.random.default_rng((self.settings.seed, self.step_number)))
+            # The budget opens gradually: what is spent early goes where the coarse images, not the fine ones, need it.
+            opened = (self.progress - d.start) / (d.stop - d.start)
+            budget = int(self.settings.start.surfels + opened * (d.max_surfels - self.settings.start.surfels))
+            rng = np.random.default_rng((self.settings.seed, self.step_number))
+            densify(self.model, self.gradients, self.extent, d, rng, budget)
         self.gradients = Gradients(len(self.model))

@@ -41,7 +41,7 @@ def test_small_surfels_are_cloned_and_moments_follow():
     hot = np.zeros(N)
     hot[[2, 7]] = 1.0
     old = moment(m, "centers")
-    densify(m, gradients(hot), 1.0, Density(), np.random.default_rng(0))
+    densify(m, gradients(hot), 1.0, Density(), np.random.default_rng(0), 1000)
     assert len(m) == N + 2
     assert np.allclose(moment(m, "centers"), [*old, 0, 0])
     assert np.allclose(m.numpy("centers")[N:], before["centers"][[2, 7]])
@@ -59,7 +59,7 @@ def test_large_surfels_are_split_in_their_plane():
     normal = m.numpy("centers")[3]
     hot = np.zeros(N)
     hot[3] = 1.0
-    densify(m, gradients(hot), 1.0, Density(), np.random.default_rng(0))
+    densify(m, gradients(hot), 1.0, Density(), np.random.default_rng(0), 1000)
     assert len(m) == N + 1
     halves = m.numpy("centers")[[3, N]]
     assert np.allclose(np.exp(m.numpy("log_scales")[[3, N]]), 0.1 / 1.6, rtol=1e-4)
@@ -73,14 +73,14 @@ def test_transparent_unseen_and_huge_surfels_go():
     m.set("logit_opacities", opacity)
     m.set("log_scales", scales)
     centers = m.numpy("centers")
-    densify(m, gradients(np.zeros(N), seen), 1.0, Density(), np.random.default_rng(0))
+    densify(m, gradients(np.zeros(N), seen), 1.0, Density(), np.random.default_rng(0), 1000)
     assert np.allclose(m.numpy("centers"), centers[3:])
 
 
 def test_budget_goes_to_the_largest_gradients():
     m = model()
     centers = m.numpy("centers")
-    densify(m, gradients(np.arange(N)), 1.0, Density(max_surfels=N + 3), np.random.default_rng(0))
+    densify(m, gradients(np.arange(N)), 1.0, Density(), np.random.default_rng(0), N + 3)
     assert len(m) == N + 3
     assert {tuple(c) for c in m.numpy("centers")[N:].round(5)} == {tuple(c) for c in centers[-3:].round(5)}
 

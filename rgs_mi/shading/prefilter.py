@@ -39,18 +39,31 @@ def _kernel_matrix(roughness, rows, columns, out_rows):
     angles = np.pi / 2 * np.linspace(0, 1, 4096) ** 2
     table = lobe(roughness, angles)
     hat = np.maximum(0, 1 - np.abs(np.arange(fine)[:, None] / nodes - np.arange(rows)))  # [fine, rows]
-    hat *= np.sin(theta)[:, None]
+    hat = (hat * np.sin(theta)[:, None]).astype(np.float32)
     theta_out = np.linspace(0, np.pi, out_rows)
+    fold = _fold(samples // 2 + 1, columns, frequencies)
     matrix = np.empty((frequencies, out_rows, rows), np.float32)
     reach = angles[np.flatnonzero(table > _NEGLIGIBLE * table[0])[-1]]
     for i, t in enumerate(theta_out):
         near = np.flatnonzero(np.abs(theta - t) <= reach)
         cosine = np.cos(t) * np.cos(theta[near, None]) + np.sin(t) * np.sin(theta[near, None]) * np.cos(delta)
         kernel = np.interp(np.arccos(np.clip(cosine, -1, 1)).astype(np.float32), angles, table, right=0.0)
-        spectrum = fft.dct(kernel.astype(np.float32), type=1, axis=1)[:, :frequencies]  # cosine series: K is even in Δφ
-        matrix[:, i] = spectrum.T @ hat[near]
-    matrix *= (np.sinc(np.arange(frequencies) / columns) ** 2)[:, None, None]
+        spectrum = fft.dct(kernel.astype(np.float32), type=1, axis=1)  # cosine series: K is even in Δφ
+        matrix[:, i] = (spectrum @ fold).T @ hat[near]
     return matrix / matrix[0].sum(1)[None, :, None]
+
+
+def _fold(count, columns, frequencies):
+    """[count, frequencies]: takes the cosine series of a kernel to the Fourier coefficients of its samples at ``columns``
+    texels. A lobe narrower than a texel has frequencies above theirs, which appear as lower ones. A coarser map, made for a
+    lobe wider than its texels, just leaves the higher ones out."""
+    f, half = np.arange(count), columns // 2
+    hat = np.sinc(f / columns) ** 2
+    if frequencies <= half:
+        return np.diag(hat)[:, :frequencies].astype(np.float32)
+    alias = np.minimum(f % columns, -f % columns)
+    twice = (alias == 0) & (f > 0) | (alias == half)  # a pair of frequencies that meet in one
+    return ((alias[:, None] == np.arange(frequencies)) * np.where(twice, 2 * hat, hat)[:, None]).astype(np.float32)
 
 
 @dataclass(frozen=True)
