@@ -44,12 +44,13 @@ def _kernel_matrix(roughness, rows, columns, out_rows):
     fold = _fold(samples // 2 + 1, columns, frequencies)
     matrix = np.empty((frequencies, out_rows, rows), np.float32)
     reach = angles[np.flatnonzero(table > _NEGLIGIBLE * table[0])[-1]]
-    for i, t in enumerate(theta_out):
+    for i, t in enumerate(theta_out[: (out_rows + 1) // 2]):
         near = np.flatnonzero(np.abs(theta - t) <= reach)
         cosine = np.cos(t) * np.cos(theta[near, None]) + np.sin(t) * np.sin(theta[near, None]) * np.cos(delta)
         kernel = np.interp(np.arccos(np.clip(cosine, -1, 1)).astype(np.float32), angles, table, right=0.0)
         spectrum = fft.dct(kernel.astype(np.float32), type=1, axis=1)  # cosine series: K is even in Δφ
         matrix[:, i] = (spectrum @ fold).T @ hat[near]
+        matrix[:, out_rows - 1 - i] = matrix[:, i, ::-1]  # the southern hemisphere mirrors the northern
     return matrix / matrix[0].sum(1)[None, :, None]
 
 
