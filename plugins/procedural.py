@@ -10,8 +10,9 @@ Procedural targets (:monosp:`procedural_mesh`, :monosp:`procedural_envmap`)
 
 ``<emitter type="procedural_envmap">``: an environment of `rgs_mi.targets.environments`, as a stock ``envmap``.
 
- * - name:       |string| e.g. ``studio``
- * - resolution: |int| height in texels; the width is twice that (Default: 512)
+ * - name:       |string| e.g. ``studio``, or ``constant``, a uniform map to start a fit from
+ * - resolution: |int| height in texels; the width is twice that (Default: 512; not of ``constant``)
+ * - radiance, rows: |float|, |int| radiance and height in texels of ``constant`` (Default: 0.5 and 128)
  * - scale:      |float| factor on the radiance (Default: 1)
  * - to_world:   |transform| as of ``envmap``, whose up is y: rotate by 90 degrees around x in a z-up world
 
@@ -44,7 +45,10 @@ def procedural_mesh(props):
 
 def procedural_envmap(props):
     """The factory of ``<emitter type="procedural_envmap">``."""
-    pixels = environments.environment(str(props["name"]), int(props.get("resolution", 512)))
+    if props["name"] == "constant":
+        pixels = environments.constant(float(props.get("radiance", 0.5)), int(props.get("rows", 128)))
+    else:
+        pixels = environments.environment(str(props["name"]), int(props.get("resolution", 512)))
     return mi.load_dict({"type": "envmap", "id": props.id(), "bitmap": mi.Bitmap(pixels),
                          "scale": float(props.get("scale", 1.0)),
                          "to_world": props.get("to_world", mi.ScalarTransform4f())})

@@ -61,6 +61,10 @@ class Camera:
         return replace(self, focal=(self.focal[0] * sx, self.focal[1] * sy),
                        principal=(self.principal[0] * sx, self.principal[1] * sy), size=(width, height))
 
+    def cropped(self, x: int, y: int, width: int, height: int) -> "Camera":
+        """The same camera, restricted to the window of ``width`` × ``height`` pixels whose corner is pixel (x, y)."""
+        return replace(self, principal=(self.principal[0] - x, self.principal[1] - y), size=(width, height))
+
     @classmethod
     def look_at(cls, origin, target, up, fov_x: float, size) -> "Camera":
         """A camera at ``origin`` that looks at ``target``; ``fov_x`` is the horizontal field of view in degrees."""

@@ -18,27 +18,48 @@ from .surfel import CHANNELS, Surfels
 _RATES = {"centers": "centers", "rotations": "rotations", "log_scales": "scales", "logit_opacities": "opacities",
           "sh_dc": "sh_dc", "sh_rest": "sh_rest", "logit_base_color": "base_color", "logit_roughness": "roughness",
           "logit_metallic": "metallic", "delta_normal": "delta_normal", ENVIRONMENT: "environment"}
+_CROP_MARGIN = 8  # pixels of background around the object that training looks at
 
 
 class Photographs:
-    """The training photographs of one pyramid level as the losses want them: display space, over the background."""
+    """The training photographs of one pyramid level as the losses want them: display space, over the background, and
+    cropped to windows of one size that hold the object in every view (one size, since each needs its own kernels)."""
 
     def __init__(self, views, downscale, background):
         self.views, self.downscale, self.background = views, downscale, background
-        self._cache = {}
+        self._images = {}
+        self._windows = _windows(views, downscale)
 
     def __getitem__(self, i):
-        """(camera, colour ``mi.Color3f``, coverage ``mi.Float``) of view ``i``, a lane a pixel."""
-        view = self.views[i]
-        if i not in self._cache:
+        """(camera, colour ``mi.Color3f``, coverage ``mi.Float``, the whole photograph's size at this level) of view ``i``,
+        a lane a pixel."""
+        view, (x, y, width, height) = self.views[i], self._windows[i]
+        if i not in self._images:
             color = display(view.pixels, 0.0)
             alpha = view.pixels[..., 3:].astype(np.float32) / (255 if view.pixels.dtype == np.uint8 else 1)
-            self._cache[i] = _shrink(np.concatenate([color, alpha], 2), self.downscale).astype(np.float16)
-        image = self._cache[i]
-        height, width, _ = image.shape
-        planes = [mi.Float(np.ascontiguousarray(image[..., c], np.float32).ravel()) for c in range(4)]
+            whole = _shrink(np.concatenate([color, alpha], 2), self.downscale)
+            window = whole[y:y + height, x:x + width].transpose(2, 0, 1).reshape(4, -1)
+            self._images[i] = np.ascontiguousarray(window).astype(np.float16), whole.shape[1::-1]
+        planes, size = self._images[i]
+        planes = [mi.Float(plane.astype(np.float32)) for plane in planes]
         color = mi.Color3f(*planes[:3]) + self.background * (1 - planes[3])
-        return view.camera.resized(width, height), color, planes[3]
+        return view.camera.resized(*size).cropped(x, y, width, height), color, planes[3], size
+
+
+def _windows(views, downscale):
+    """One (x, y, width, height) a view, in pixels of the level: around the mask, of one size where photographs are."""
+    sizes = [tuple(max(n // downscale, 1) if n >= downscale else n for n in v.camera.size) for v in views]
+    if len(set(sizes)) > 1 or not all(v.masked for v in views):
+        return [(0, 0, *size) for size in sizes]
+    boxes = []
+    for view in views:
+        rows, columns = (np.flatnonzero((view.pixels[..., 3] > 0).any(axis)) for axis in (1, 0))
+        boxes.append([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1])
+    boxes = np.array(boxes) / downscale
+    wanted = (boxes[:, 2:] - boxes[:, :2]).max(0) + 2 * _CROP_MARGIN
+    size = np.minimum(np.ceil(wanted / 8) * 8, sizes[0]).astype(int)
+    corners = np.clip(np.round((boxes[:, :2] + boxes[:, 2:] - size) / 2), 0, sizes[0] - size).astype(int)
+    return [(int(x), int(y), int(size[0]), int(size[1])) for x, y in corners]
 
 
 def _shrink(image, factor):
@@ -126,7 +147,7 @@ class Fit:
 
     def _view(self, i, surfels, filtered, weight):
         """Accumulate the gradients of one view's loss; returns its mean squared error."""
-        camera, target, alpha = self.photographs[i]
+        camera, target, alpha, whole = self.photographs[i]
         w = self.settings.weights
         offset = dr.zeros(mi.Vector2f, len(self.model))
         dr.enable_grad(offset)
@@ -140,9 +161,10 @@ class Fit:
             loss += w.consistency * losses.depth_normal_consistency(image.gbuffer, camera)
         if w.smoothness > 0:
             loss += w.smoothness * losses.normal_smoothness(image.gbuffer)
-        error = dr.mean(dr.mean(dr.square(dr.detach(rendered) - target)))
-        dr.backward(loss * weight)
-        self.gradients.add(dr.grad(offset) / weight, image.gbuffer.seen, camera.size)
+        share = camera.size[0] * camera.size[1] / (whole[0] * whole[1])  # losses are means over the whole photograph
+        error = dr.mean(dr.mean(dr.square(dr.detach(rendered) - target))) * share
+        dr.backward(loss * (weight * share))
+        self.gradients.add(dr.grad(offset) / weight, image.gbuffer.seen, whole)
         return error
 
     def _next_views(self, count):

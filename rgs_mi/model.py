@@ -40,8 +40,9 @@ class Model:
 
     @classmethod
     def start(cls, positions, normals, colors, spacing, environment, rotation, sh_order, seed=0, scale=1.0):
-        """Surfels at ``positions`` [N, 3], facing ``normals`` [N, 3] (outward, one-sided; None: random, two-sided), of ``colors`` [N, 3] (linear), as wide
-        as ``scale`` times their ``spacing`` [N]; ``environment`` [rows, columns, 3] radiance to start from."""
+        """Surfels at ``positions`` [N, 3], facing ``normals`` [N, 3] (outward, one-sided; None: random, two-sided), of
+        ``colors`` [N, 3] (linear), as wide as ``scale`` times their ``spacing`` [N]; ``environment`` [rows, columns, 3]
+        radiance to start from."""
         from .surfel import rotation_from_normal
 
         n, rng = len(positions), np.random.default_rng(seed)

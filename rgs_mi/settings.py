@@ -29,7 +29,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rates; a pair is the first and the last, joined geometrically. Positions are in units of the object."""
+    """Adam's learning rates: the first and the last, joined geometrically. Positions are in units of the object."""
 
     centers: tuple[float, float] = (5e-4, 1e-5)
     rotations: tuple[float, float] = (5e-3, 5e-4)

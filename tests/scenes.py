@@ -17,7 +17,8 @@ def sphere_surfels(n, seed=0, scale=0.6, opacity_shift=1.0, order=1):
     return Surfels.from_numpy({
         "centers": x, "rotations": rotation_from_normal(normal, rng.uniform(0, 6, n)),
         "scales": np.exp(rng.normal(size=(n, 2)) * 0.3) * np.sqrt(4 * np.pi / n) * scale,
-        "opacities": logistic(rng.normal(size=(n, 1)) + opacity_shift), "sh": rng.normal(size=(n, 3 * (order + 1) ** 2)) * 0.1,
+        "opacities": logistic(rng.normal(size=(n, 1)) + opacity_shift),
+        "sh": rng.normal(size=(n, 3 * (order + 1) ** 2)) * 0.1,
         "base_color": rng.uniform(0.2, 0.9, (n, 3)), "roughness": rng.uniform(0.1, 0.9, (n, 1)),
         "metallic": rng.uniform(0.1, 0.9, (n, 1)), "delta_normal": rng.normal(size=(n, 3)) * 0.05})
 

@@ -18,8 +18,8 @@ def model():
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     m = Model.start(normals, normals, rng.uniform(0, 1, (N, 3)), np.full(N, 0.005), np.full((8, 16, 3), 0.5), np.eye(3), 2)
     for name in m.optimizer.keys():  # moments that tell the surfels apart
-        dr.set_grad(m.optimizer[name], mi.TensorXf(np.broadcast_to(
-            np.arange(1, 1 + m[name].shape[0], dtype=np.float32).reshape(-1, *[1] * (m[name].ndim - 1)), m[name].shape).copy()))
+        rows = np.arange(1, 1 + m[name].shape[0], dtype=np.float32).reshape(-1, *[1] * (m[name].ndim - 1))
+        dr.set_grad(m.optimizer[name], mi.TensorXf(np.broadcast_to(rows, m[name].shape).copy()))
     m.optimizer.set_learning_rate({name: 1e-6 for name in m.optimizer.keys()})
     m.optimizer.step()
     return m

@@ -4,12 +4,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from scenes import orbit_camera, sphere_surfels
 from scipy import ndimage
 
 from rgs_mi import losses
 from rgs_mi.color import srgb_encode
 from rgs_mi.splat.gbuffer import render_gbuffer
+
+from scenes import orbit_camera, sphere_surfels
 
 SIZE = (23, 17)  # width, height
 

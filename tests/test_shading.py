@@ -4,12 +4,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from scenes import orbit_camera, sphere_surfels
 
 from rgs_mi.shading import deferred, prefilter, split_sum, tables
 from rgs_mi.shading.environment import Environment
 from rgs_mi.surfel import CHANNELS, Surfels
 
+from scenes import orbit_camera, sphere_surfels
 
 
 def unit(rng, n):
@@ -72,7 +72,8 @@ def test_prefilter_transpose_and_constants(rows):
     operator = prefilter.prefilter(rows, 2 * rows, mi.variant())
     x = rng.normal(size=(rows, 2 * rows, 3)).astype(np.float32)
     y = rng.normal(size=(operator.texels, 3)).astype(np.float32)
-    forward, backward = (y.astype(np.float64) * operator.apply(x)).sum(), (x.astype(np.float64) * operator.transpose(y)).sum()
+    forward = (y.astype(np.float64) * operator.apply(x)).sum()
+    backward = (x.astype(np.float64) * operator.transpose(y)).sum()
     assert forward == pytest.approx(backward, rel=1e-4, abs=1e-3)
     assert np.allclose(operator.apply(np.full_like(x, 2.5)), 2.5, atol=1e-4)
 
@@ -113,7 +114,8 @@ def test_gradients_equal_finite_differences():
     for name in ("texels", "base_color", "roughness", "metallic", "delta_normal", "sh"):
         gradient = dr.grad(texels if name == "texels" else getattr(surfels, name)).numpy().astype(np.float64)
         direction = rng.normal(size=gradient.shape) * max(np.abs(base[name]).mean(), 0.3)
-        value = lambda h: (render(base | {name: base[name] + h * direction})[0].color.numpy().astype(np.float64) * weights).sum()
+        moved = lambda h: render(base | {name: base[name] + h * direction})[0].color.numpy().astype(np.float64)
+        value = lambda h: (moved(h) * weights).sum()
         central = lambda h: (value(h) - value(-h)) / (2 * h)
         expected = (4 * central(1e-3) - central(2e-3)) / 3
         size = np.linalg.norm(gradient) * np.linalg.norm(direction)

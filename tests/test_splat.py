@@ -6,12 +6,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from scenes import orbit_camera, sphere_surfels
 
 from rgs_mi.splat import gbuffer
 from rgs_mi.splat.reference import render_gbuffer_reference
 from rgs_mi.splat.tiles import Cutoffs
 from rgs_mi.surfel import CHANNELS, Surfels
+
+from scenes import orbit_camera, sphere_surfels
 
 MAPS = ("diffuse", "normal", "base_color", "roughness", "metallic", "delta_normal", "depth", "alpha")
 SMOOTH = Cutoffs(alpha_min=1e-7, alpha_max=0.9999, transmittance_min=0)

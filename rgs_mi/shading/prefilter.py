@@ -90,7 +90,7 @@ class Prefilter:
         rows, columns = self.size
         spectrum = fft.rfft(texels.transpose(1, 0, 2), axis=0)  # [M, rows, 3]
         out = [texels.reshape(-1, 3)]
-        for (r, c), matrix in zip(self.maps[1:], self.matrices):
+        for (_, c), matrix in zip(self.maps[1:], self.matrices):
             m = matrix.shape[0]
             product = matrix @ spectrum[:m].view(np.float32)
             level = product.view(np.complex64) * self._phase(m, c)[:, None, None] * np.float32(c / columns)

@@ -223,7 +223,8 @@ class Composite(dr.CustomOp):
                 state[k], T[k] = (T_ - w_, out_), T[k] - w
             return T, state
 
-        state = _walk(self.lists, layout, lambda pixels: [(mi.Float(0), [mi.Float(0)] * (n + 2)) for _ in range(pixels)], body)
+        start = lambda pixels: [(mi.Float(0), [mi.Float(0)] * (n + 2)) for _ in range(pixels)]
+        state = _walk(self.lists, layout, start, body)
         self.set_grad_out(_scatter_image([out_ for _, out_ in state], layout))
 
     def name(self):

@@ -32,7 +32,8 @@ def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> Maps:
     d = mi.Vector3f(np.ascontiguousarray(camera.rays().reshape(-1, 3).T.astype(np.float32)))  # camera-space z is 1
     d = dr.gather(mi.Vector3f, d, pixel)
     t_u, t_v, normal = (dr.gather(mi.Vector3f, v, surfel) for v in surfels.frames())
-    centre, scales, z = dr.gather(mi.Point3f, centers, surfel) - origin, of(mi.Vector2f, "scales"), dr.gather(mi.Float, depth, surfel)
+    centre, z = dr.gather(mi.Point3f, centers, surfel) - origin, dr.gather(mi.Float, depth, surfel)
+    scales = of(mi.Vector2f, "scales")
     facing = dr.dot(centre, normal)
     t = facing / dr.dot(d, normal)
     u, v = dr.dot(t * d - centre, t_u) / scales.x, dr.dot(t * d - centre, t_v) / scales.y
@@ -53,7 +54,8 @@ def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> Maps:
 
     delta = of(mi.Vector3f, "delta_normal")
     radiance = dr.gather(mi.Color3f, surfels.radiance(dr.normalize(centers - origin)), surfel)
-    accumulate = lambda kind, value: kind(*[dr.block_sum(weight * c, n) for c in (value if kind is not mi.Float else [value])])
+    columns = lambda kind, value: [value] if kind is mi.Float else value
+    accumulate = lambda kind, value: kind(*[dr.block_sum(weight * c, n) for c in columns(kind, value)])
     return Maps(
         diffuse=accumulate(mi.Color3f, radiance),
         normal=accumulate(mi.Vector3f, dr.select(facing > 0, -normal, normal) + delta),

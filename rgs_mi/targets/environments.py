@@ -199,3 +199,10 @@ def environment(name: str, height: int = 512) -> np.ndarray:
     s = SUPERSAMPLING
     fine = painter(directions(s * height, 2 * s * height).reshape(-1, 3))
     return fine.reshape(height, s, 2 * height, s, 3).mean((1, 3)).astype(np.float32)
+
+
+def constant(radiance: float, height: int) -> np.ndarray:
+    """[height, 2 * height, 3] float32 map of one radiance. Raises: UserError for a height below 2."""
+    if height < 2:
+        raise UserError(f"environment 'constant': rows is {height}, needs at least 2")
+    return np.full((height, 2 * height, 3), radiance, np.float32)

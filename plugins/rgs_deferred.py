@@ -1,0 +1,193 @@
+"""
+Deferred shading of surfels (:monosp:`rgs_deferred`)
+----------------------------------------------------
+
+Splats all shapes of type :monosp:`surfels` into a G-buffer and shades every pixel once: their diffuse radiance, plus
+what a principled BSDF with the G-buffer's material reflects of the environment (Reflection-aware Gaussian splatting).
+
+.. pluginparameters::
+
+ * - specular
+   - |string|
+   - ``split_sum``: the environment filtered by roughness times the directional albedo; ``none``: diffuse radiance only
+     (Default: ``split_sum``)
+
+ * - hide_emitters
+   - |bool|
+   - Whether pixels show nothing behind the surfels, with their coverage as alpha, rather than the environment
+     (Default: |false|)
+
+ * - aovs
+   - |string|
+   - Further channels, a comma-separated list out of those below (Default: none)
+
+Channels of ``aovs`` follow Mitsuba's `aov` integrator. As all that a film holds they are premultiplied by the surfels'
+coverage: divide by ``alpha.Y`` for means.
+
+ * ``depth.T``: distance along the ray                ``normal.X .Y .Z``: shading normal, world space, not normalised
+ * ``albedo.R .G .B``: the base colour                ``roughness.Y``, ``metallic.Y``
+ * ``diffuse.R .G .B``, ``specular.R .G .B``: the two parts of the radiance       ``alpha.Y``: coverage
+
+The scene needs an ``envmap`` or ``constant`` emitter and a ``perspective`` sensor; other shapes and emitters are
+ignored. ``mi.render`` differentiates, in both modes, with respect to all fields of the surfels and the radiance of the
+environment, not to the sensor. Nothing is random: ``spp``, rounded up to a square, is the number of points of a regular
+grid in each pixel, over which the pixel is averaged whatever the film's reconstruction filter.
+"""
+
+import math
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from rgs_mi.camera import Camera
+from rgs_mi.errors import UserError
+from rgs_mi.shading import deferred, prefilter
+from rgs_mi.shading.environment import Environment, FilteredEnvironment
+from rgs_mi.splat.gbuffer import render_gbuffer
+from rgs_mi.surfel import CHANNELS
+
+from .surfels import SurfelShape
+
+AOVS = {"depth": "T", "normal": "XYZ", "albedo": "RGB", "roughness": "Y", "metallic": "Y", "alpha": "Y",
+        "specular": "RGB", "diffuse": "RGB"}
+ESTIMATORS = ("split_sum", "none")
+
+
+class DeferredIntegrator(mi.SamplingIntegrator):
+    def __init__(self, props):
+        super().__init__(props)  # takes hide_emitters
+        if not mi.is_rgb:
+            raise UserError(f"rgs_deferred: variant '{mi.variant()}' is not supported: use llvm_ad_rgb or cuda_ad_rgb")
+        self.specular = props.get("specular", "split_sum")
+        if self.specular not in ESTIMATORS:
+            raise UserError(f"rgs_deferred: unknown specular '{self.specular}': choose one of {', '.join(ESTIMATORS)}")
+        self.aovs = [name.strip() for name in props.get("aovs", "").split(",") if name.strip()]
+        if unknown := [name for name in self.aovs if name not in AOVS]:
+            raise UserError(f"rgs_deferred: unknown aov '{unknown[0]}': choose from {', '.join(AOVS)}")
+        self.filtered = None
+
+    def aov_names(self):
+        return [f"{name}.{channel}" for name in self.aovs for channel in AOVS[name]]
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        film = sensor.film()
+        if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+            raise UserError(f"rgs_deferred: film '{film.id()}' is a {film.class_name()}: use an 'hdrfilm'")
+        film.prepare(self.aov_names())
+        samples = math.ceil(math.sqrt(spp or sensor.sampler().sample_count()))
+        has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+        channels = self._channels(scene, Camera.from_sensor(sensor), samples, has_alpha)
+        film.put_block(mi.ImageBlock(channels, film.crop_offset()))
+        image = film.develop() if develop else mi.TensorXf()
+        if evaluate:
+            dr.eval(image)
+        return image
+
+    # Without these two, mi.render() differentiates through a fallback that unrolls all loops.
+
+    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+        image = self.render(scene, sensor, seed, spp, evaluate=False)
+        dr.forward_to(image)
+        return dr.grad(image)
+
+    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+        image = self.render(scene, sensor, seed, spp, evaluate=False)
+        dr.backward_from(image * grad_in)
+
+    def to_string(self):
+        return f"DeferredIntegrator[specular = {self.specular}, aovs = {', '.join(self.aovs)}]"
+
+    # ---- One image ----
+
+    def _channels(self, scene, camera, samples, has_alpha):
+        """[height, width, channels] in the layout of the film's block: R, G, B, (alpha,) weight, AOVs."""
+        width, height = camera.size
+        camera = camera.resized(width * samples, height * samples)
+        surfels, eta = _surfels(scene)
+        filtered = self._filtered_environment(scene)
+        gbuffer = render_gbuffer(surfels, camera)
+        maps = gbuffer.maps()
+        if self.specular == "none":
+            image = deferred.Image(maps.diffuse, maps.diffuse, mi.Color3f(0), gbuffer)
+        else:
+            image = deferred.shade(gbuffer, camera, filtered, eta)
+        rays = deferred.pixel_directions(camera, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]))
+        color, alpha = image.color, maps.alpha
+        if not self.hide_emitters and filtered is not None:
+            color, alpha = color + (1 - alpha) * filtered.eval(rays), mi.Float(1)
+        values = [*color, *([alpha] if has_alpha else []), mi.Float(1)]
+        for name in self.aovs:
+            values += _aov(name, image, maps, camera, rays)
+        return _average(values, width, height, samples)
+
+    def _filtered_environment(self, scene):
+        """The scene's environment, filtered as the estimator needs it; kept until texels change."""
+        emitter = scene.environment()
+        if emitter is None:
+            if self.specular == "none":
+                return None
+            raise UserError("rgs_deferred: the scene has no environment: add an 'envmap' or 'constant' emitter")
+        environment = Environment.from_emitter(emitter)
+        if self.specular == "none":
+            mirror = prefilter.Prefilter(environment.size, (environment.size,), ())
+            return FilteredEnvironment(prefilter.apply(environment.texels.array, mirror), mirror, environment)
+        if dr.grad_enabled(environment.texels):
+            return environment.filtered()
+        if self.filtered is None or not _equal(self.filtered.environment.texels, environment.texels):
+            self.filtered = environment.filtered()
+        return replace(self.filtered, environment=environment)
+
+
+def _surfels(scene):
+    """(all surfels of the scene as one, their index of refraction)."""
+    shapes = [shape for shape in scene.shapes() if isinstance(shape, SurfelShape) and len(shape.surfels)]
+    if not shapes:
+        raise UserError("rgs_deferred: the scene has no surfels: add a <shape type=\"surfels\"> with a 'filename'")
+    for name in ("eta", "two_sided"):
+        if len(values := {getattr(shape, name) for shape in shapes}) > 1:
+            raise UserError(f"rgs_deferred: shapes of surfels differ in '{name}' ({', '.join(map(str, values))})")
+    clouds = [shape.surfels for shape in shapes]
+    return clouds[0] if len(clouds) == 1 else _concatenate(clouds), shapes[0].eta
+
+
+def _concatenate(clouds):
+    """Several `Surfels` as one. Spherical harmonics of lower order are padded with zeros."""
+    channels = max(cloud.sh.shape[1] for cloud in clouds)
+
+    def column(cloud, name):
+        value = getattr(cloud, name)
+        missing = channels - value.shape[1] if name == "sh" else 0
+        return dr.concat((value, dr.zeros(mi.TensorXf, (len(cloud), missing))), axis=1) if missing else value
+
+    fields = {name: dr.concat([column(cloud, name) for cloud in clouds], axis=0) for name in CHANNELS}
+    return replace(clouds[0], **fields)
+
+
+def _aov(name, image, maps, camera, rays):
+    """Channels of one AOV, premultiplied, a list of ``mi.Float`` with one lane a sample."""
+    if name == "depth":
+        forward = mi.Vector3f(*[dr.opaque(mi.Float, float(v)) for v in camera.rotation[2]])
+        return [maps.depth / dr.dot(rays, forward)]
+    value = {"normal": maps.normal, "albedo": maps.base_color, "roughness": maps.roughness, "metallic": maps.metallic,
+             "alpha": maps.alpha, "specular": image.specular, "diffuse": image.diffuse}[name]
+    return [value] if isinstance(value, mi.Float) else [*value]
+
+
+def _average(values, width, height, samples):
+    """[height, width, channels] means over samples × samples blocks of ``values``, which have one lane a sample."""
+    n = width * height * samples**2
+    flat = dr.empty(mi.Float, n * len(values))
+    row = dr.arange(mi.UInt32, n) * len(values)
+    for k, value in enumerate(values):
+        dr.scatter(flat, value, row + k)
+    tensor = mi.TensorXf(flat, (height, samples, width, samples, len(values)))
+    return dr.mean(tensor, axis=(1, 3)) if samples > 1 else dr.reshape(tensor, (height, width, len(values)))
+
+
+def _equal(a, b):
+    return a.shape == b.shape and dr.all(a.array == b.array)
+
+
+mi.register_integrator("rgs_deferred", DeferredIntegrator)

@@ -1,0 +1,180 @@
+"""
+Surfels (:monosp:`surfels`)
+---------------------------
+
+Flat Gaussians with a principled material (`rgs_mi.surfel.Surfels`), for the integrator :monosp:`rgs_deferred`.
+
+.. pluginparameters::
+
+ * - filename
+   - |string|
+   - PLY of surfels, from rgs_mi, 2DGS or 3DGS; relative to the scene's folder (Default: no surfels)
+
+ * - centers, rotations, scales, opacities, sh, base_color, roughness, metallic, delta_normal
+   - |tensor|
+   - The fields themselves, in physical ranges; in a dictionary only. They replace those of the file.
+   - |exposed|, |differentiable|; the first three also |discontinuous|
+
+ * - two_sided
+   - |bool|
+   - Whether surfels show from behind; not needed for closed objects whose normals point outwards. (Default: |true|)
+
+ * - photographs
+   - |string|
+   - What a fit learns from: a data folder, or a Mitsuba scene to path-trace. Kept for `rgs_mi.fit`, not opened here.
+
+ * - proxies
+   - |bool|
+   - Whether rays hit the surfels, as quads of three standard deviations, two triangles each: surfel number i is
+     ``prim_index // 2``. They are opaque and diffuse to Mitsuba's integrators, and moving them rebuilds the
+     acceleration structure. (Default: |false|, rays pass)
+
+ * - (Nested plugin)
+   - |bsdf|
+   - A :monosp:`principled` BSDF: the dielectric lobe has its constant ``eta`` or ``specular`` as it was when loaded,
+     the rest of it is ignored. (Default: eta = 1.5)
+
+Tensors of another length may be assigned, which is how a fit adds and removes surfels: all nine before
+``params.update()``. Surfels live in world space: a ``to_world`` is an error. Without proxies rays meet nothing, yet
+``bbox()`` is right, by means of one triangle of no area along its diagonal.
+"""
+
+import drjit as dr
+import mitsuba as mi
+
+from rgs_mi.errors import UserError
+from rgs_mi.ply import read_ply
+from rgs_mi.shading.split_sum import DEFAULT_ETA
+from rgs_mi.surfel import CHANNELS, Surfels
+
+EXTENT = 3.0  # half the width of a proxy, in standard deviations
+GEOMETRY = ("centers", "rotations", "scales")
+CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+TRIANGLES = (0, 1, 2, 0, 2, 3)
+
+
+class _MeshBuffers(mi.TraversalCallback):
+    """Writes the buffers of the C++ mesh, which a Python `traverse` hides."""
+
+    def __init__(self, buffers):
+        super().__init__()
+        self.buffers = buffers
+
+    def put(self, name, value, _flags, cpptype=None):
+        if name in self.buffers:
+            mi.set_property(value, cpptype, self.buffers[name])
+
+
+class SurfelShape(mi.Mesh):
+    def __init__(self, props):
+        super().__init__(props)
+        if "to_world" in props:
+            raise UserError(f"surfels '{self.id()}': 'to_world' is not supported: transform the file instead")
+        self.photographs = _resolve(props.get("photographs", ""))
+        self.proxies = props.get("proxies", False)
+        self.two_sided = props.get("two_sided", True)
+        self.eta = _eta(self, props)
+        fields = _load(props)
+        for name in CHANNELS:
+            setattr(self, name, mi.TensorXf(props.get(name, fields[name])))  # a copy: Mitsuba writes in place
+        self._check()
+        self._rebuild()
+
+    @property
+    def surfels(self) -> Surfels:
+        """The live tensors, with their gradients."""
+        return Surfels(**{name: getattr(self, name) for name in CHANNELS}, two_sided=self.two_sided)
+
+    def traverse(self, callback):
+        for name in CHANNELS:
+            flags = mi.ParamFlags.Differentiable
+            if name in GEOMETRY:
+                flags = flags | mi.ParamFlags.Discontinuous
+            callback.put(name, getattr(self, name), flags)
+
+    def parameters_changed(self, keys):
+        self._check()
+        if not keys or set(GEOMETRY) & set(keys):
+            self._rebuild()
+
+    def _check(self):
+        """Raises: UserError where fields differ in length, or one has a wrong number of channels."""
+        shapes = {name: tuple(getattr(self, name).shape) for name in CHANNELS}
+        if len({shape[0] for shape in shapes.values()}) > 1:
+            lengths = ", ".join(f"{name} {shape[0]}" for name, shape in shapes.items())
+            raise UserError(f"surfels '{self.id()}': fields differ in length ({lengths}): assign all of them")
+        for name, shape in shapes.items():
+            expected = (CHANNELS[name],) if CHANNELS[name] else (3, 12, 27, 48)
+            if len(shape) != 2 or shape[1] not in expected:
+                raise UserError(f"surfels '{self.id()}': '{name}' has shape {shape}: "
+                                f"needs [N, {' or '.join(map(str, expected))}]")
+
+    def _rebuild(self):
+        """Geometry of the mesh: the proxies, or a diagonal of their bounding box."""
+        with dr.suspend_grad():
+            if len(self.surfels) == 0:
+                positions, faces = dr.zeros(mi.Float, 9), mi.UInt32(0, 1, 2)
+            elif self.proxies:
+                positions, faces = _quads(_corners(self.surfels))
+            else:
+                positions, faces = _diagonal(_corners(self.surfels)), mi.UInt32(0, 1, 2)
+            dr.eval(positions, faces)
+            mi.Mesh.traverse(self, _MeshBuffers({"vertex_positions": positions, "faces": faces}))
+        mi.Mesh.parameters_changed(self, ["vertex_positions", "faces"])
+
+    def to_string(self):
+        return f"Surfels[id = {self.id()}, count = {len(self.surfels)}, proxies = {self.proxies}]"
+
+
+def _resolve(path):
+    """``path`` as Mitsuba's own plugins find files: relative to the scene."""
+    return str(mi.file_resolver().resolve(path)) if path else ""
+
+
+def _load(props):
+    """The fields of the PLY, or empty ones."""
+    if "filename" in props:
+        return {name: mi.TensorXf(array) for name, array in read_ply(_resolve(props["filename"])).items()}
+    return {name: dr.zeros(mi.TensorXf, (0, channels or 3)) for name, channels in CHANNELS.items()}
+
+
+def _eta(shape, props):
+    """Index of refraction of the nested BSDF. Raises: UserError where that is not a principled one."""
+    if not any(isinstance(value, mi.BSDF) for _, value in props.objects()):
+        return DEFAULT_ETA
+    bsdf = shape.bsdf()
+    if bsdf.class_name() != "Principled":
+        raise UserError(f"surfels '{shape.id()}': the nested BSDF is a {bsdf.class_name()}: surfels need 'principled'")
+    params = mi.traverse(bsdf)
+    if "eta" in params:
+        return round(params["eta"][0], 6)
+    return round(2 / (1 - (0.08 * params["specular"][0]) ** 0.5) - 1, 6)
+
+
+def _corners(surfels):
+    """Corners of every surfel's quad, four ``mi.Point3f`` of width N."""
+    t_u, t_v, _ = surfels.frames()
+    center, scale = surfels.column(mi.Point3f, "centers"), EXTENT * surfels.column(mi.Vector2f, "scales")
+    return [center + i * scale.x * t_u + j * scale.y * t_v for i, j in CORNERS]
+
+
+def _quads(corners):
+    """(positions, faces) of two triangles a surfel."""
+    n = dr.width(corners)
+    i = dr.arange(mi.UInt32, n)
+    positions, faces = dr.empty(mi.Float, 12 * n), dr.empty(mi.UInt32, 6 * n)
+    for k, corner in enumerate(corners):
+        dr.scatter(positions, corner, 4 * i + k)
+    for k, vertex in enumerate(TRIANGLES):
+        dr.scatter(faces, 4 * i + vertex, 6 * i + k)
+    return positions, faces
+
+
+def _diagonal(corners):
+    """Positions of a triangle of no area from the lowest to the highest corner of the bounding box."""
+    reduce = lambda op, pick: [op(component) for component in pick(pick(*corners[:2]), pick(*corners[2:]))]
+    lower, upper = reduce(dr.min, dr.minimum), reduce(dr.max, dr.maximum)
+    return dr.concat([*lower, *upper, *upper])
+
+
+mi.register_shape("surfels", SurfelShape)

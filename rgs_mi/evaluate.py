@@ -1,0 +1,82 @@
+"""How good a fit is: held-out views rendered, compared with their photographs, and timed."""
+
+import time
+from dataclasses import dataclass
+
+import drjit as dr
+import numpy as np
+
+from . import losses, metrics
+from .color import display
+from .shading import deferred
+
+#: Figures of one view; the mean over views has the same names.
+SCORES = ("psnr", "ssim", "normal_mae_deg")
+
+
+@dataclass
+class Rendering:
+    """A rendered view as NumPy arrays, float32.
+
+      image:  [H, W, 3] display values in [0, 1] over the background, what is compared with the photograph
+      alpha:  [H, W, 1] coverage
+      maps:   name -> [H, W, channels], premultiplied by coverage: color, diffuse, specular (linear radiance), normal
+              (world space, unit length before), base_color, roughness, metallic, depth
+    """
+
+    image: np.ndarray
+    alpha: np.ndarray
+    maps: dict[str, np.ndarray]
+
+
+def render_view(surfels, filtered, camera, background) -> Rendering:
+    """Render ``surfels`` under a `FilteredEnvironment` over the display-space grey level ``background``."""
+    width, height = camera.size
+    array = lambda v: np.atleast_2d(dr.detach(v).numpy()).T.reshape(height, width, -1)
+    with dr.suspend_grad():
+        image = deferred.render(surfels, camera, filtered)
+        m = image.gbuffer.maps()
+        length = dr.norm(m.normal)
+        normal = dr.select(length > 0, m.normal * (m.alpha / length), 0)
+        shown = losses.display(image.color, m.alpha, background)
+        maps = {"color": image.color, "diffuse": image.diffuse, "specular": image.specular, "normal": normal,
+                "base_color": m.base_color, "roughness": m.roughness, "metallic": m.metallic, "depth": m.depth}
+        dr.eval(shown, m.alpha, maps)
+    return Rendering(np.clip(array(shown), 0, 1), array(m.alpha), {k: array(v) for k, v in maps.items()})
+
+
+def photograph(view, background) -> np.ndarray:
+    """[H, W, 3] the photograph of ``view`` as `Rendering.image` has it."""
+    return display(view.pixels, background)
+
+
+def score(view, rendering: Rendering, background) -> dict:
+    """The `SCORES` of one view; ``normal_mae_deg`` is None where the view has no normals."""
+    truth = photograph(view, background)
+    alpha = view.pixels[..., 3] / (255 if view.pixels.dtype == np.uint8 else 1)
+    return {"psnr": metrics.psnr(rendering.image, truth), "ssim": metrics.ssim(rendering.image, truth),
+            "normal_mae_deg": None if view.normal is None
+            else _finite(metrics.normal_mae_deg(rendering.maps["normal"], view.normal, alpha))}
+
+
+def mean_scores(scores: list[dict]) -> dict:
+    """The mean of each figure over the views that have it, None where none has."""
+    known = {name: [s[name] for s in scores if s[name] is not None] for name in SCORES}
+    return {name: float(np.mean(values)) if values else None for name, values in known.items()}
+
+
+def _finite(value):
+    return value if np.isfinite(value) else None
+
+
+def frames_per_second(surfels, filtered, cameras, frames=20) -> float:
+    """Views per second, G-buffer and shading, kernels compiled and the environment filtered beforehand: the median."""
+    seconds = []
+    with dr.suspend_grad():
+        for k in range(frames + 1):
+            dr.sync_thread()
+            start = time.perf_counter()
+            dr.eval(deferred.render(surfels, cameras[k % len(cameras)], filtered).color)
+            dr.sync_thread()
+            seconds.append(time.perf_counter() - start)
+    return float(1 / np.median(seconds[1:]))

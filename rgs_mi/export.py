@@ -1,0 +1,97 @@
+"""A fit as files that Mitsuba loads: surfels, environment, and the scene that puts them together."""
+
+import copy
+import warnings
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from .checkpoint import atomic_file
+from .ply import write_ply
+
+SURFELS, ENVIRONMENT, SCENE = "object.ply", "environment.exr", "scene.xml"
+
+
+def write_exr(path, pixels: np.ndarray, channels=None):
+    """Write [H, W, C] as a float32 EXR, whole or not at all; ``channels`` names them (None: RGB)."""
+    formats = mi.Bitmap.PixelFormat
+    pixels = np.ascontiguousarray(pixels, np.float32)
+    bitmap = mi.Bitmap(pixels, formats.MultiChannel, channels) if channels else mi.Bitmap(pixels, formats.RGB)
+    memory = mi.MemoryStream()
+    bitmap.write(memory, mi.Bitmap.FileFormat.OpenEXR)
+    with atomic_file(path) as stream:
+        stream.write(memory.raw_buffer())
+
+
+def export(folder, scene, surfels, environment, views) -> list[Path]:
+    """Write ``object.ply``, ``environment.exr`` and ``scene.xml`` into ``folder`` and return their paths.
+
+    The scene is the one that was fitted (a `FitScene`) with the results in place of where the fit started, and a sensor
+    for each of ``views``, whose id is the view's name: ``mi.render(mi.load_file("scene.xml"), sensor=i)``.
+    Raises: UserError where the disk is full or the folder can't be written.
+    """
+    folder = Path(folder)
+    write_ply(folder / SURFELS, surfels.numpy())
+    write_exr(folder / ENVIRONMENT, environment.texels.numpy())
+    root = _fitted(scene, surfels, environment)
+    if any(abs(v.camera.focal[0] / v.camera.focal[1] - 1) > 1e-4 for v in views):
+        warnings.warn(f"{folder / SCENE}: the cameras' pixels are not square, those of its sensors are", stacklevel=2)
+    root.extend(_sensor(view) for view in views)
+    ET.indent(root, "    ")
+    with atomic_file(folder / SCENE) as stream:
+        ET.ElementTree(root).write(stream, encoding="utf-8", xml_declaration=True)
+    return [folder / SCENE, folder / SURFELS, folder / ENVIRONMENT]
+
+
+def sensor_id(name: str) -> str:
+    """The id of a view's sensor: Mitsuba reads '.' as the path of a parameter."""
+    return name.replace(".", "_")
+
+
+def _fitted(scene, surfels, environment):
+    """The scene's XML with results in place of photographs and of the starting light, and without sensors."""
+    root = copy.deepcopy(scene.root)
+    for sensor in root.findall("sensor"):
+        root.remove(sensor)
+    shape = scene.surfels_element(root)
+    shape.remove(shape.find("*[@name='photographs']"))
+    shape.insert(0, _element("string", "filename", SURFELS))
+    shape.insert(1, _element("boolean", "two_sided", str(surfels.two_sided).lower()))
+    emitter = scene.emitter_element(root)
+    emitter[:] = [_element("string", "filename", ENVIRONMENT), _transform(environment.rotation)]
+    emitter.set("type", "envmap")
+    for default in root.findall("default"):
+        name = default.get("name")
+        default.set("value", scene.variables.get(name, default.get("value")))
+        if f"${name}" not in ET.tostring(root, encoding="unicode"):
+            root.remove(default)
+    return root
+
+
+def _sensor(view):
+    d = view.camera.to_sensor_dict()
+    sensor = ET.Element("sensor", type="perspective", id=sensor_id(view.name))
+    numbers = ("fov", "principal_point_offset_x", "principal_point_offset_y")
+    film = ET.Element("film", type="hdrfilm")
+    film.extend([_element("integer", "width", d["film"]["width"]), _element("integer", "height", d["film"]["height"]),
+                 _element("string", "pixel_format", "rgba"), ET.Element("rfilter", type="box")])
+    sampler = ET.Element("sampler", type="independent")
+    sampler.append(_element("integer", "sample_count", 1))
+    sensor.extend([_transform(np.array(d["to_world"].matrix)), _element("string", "fov_axis", "x"),
+                   *(_element("float", name, f"{d[name]:.9g}") for name in numbers), film, sampler])
+    return sensor
+
+
+def _transform(matrix):
+    """A ``to_world`` from [3, 3] or [4, 4]."""
+    full = np.eye(4)
+    full[:len(matrix), :len(matrix)] = matrix
+    transform = ET.Element("transform", name="to_world")
+    ET.SubElement(transform, "matrix", value=" ".join(f"{v:.9g}" for v in full.ravel()))
+    return transform
+
+
+def _element(tag, name, value):
+    return ET.Element(tag, name=name, value=str(value))

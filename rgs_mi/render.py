@@ -1,0 +1,108 @@
+"""Pictures of a fitted scene from its own views or from a turntable, through ``mi.load_file`` and ``mi.render``."""
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from .camera import Camera
+from .color import srgb_encode
+from .errors import UserError
+from .export import SCENE, write_exr
+from .pictures import write_png
+from .progress import Progress
+from .scene import load_scene, surfels_of
+from .shading.environment import Environment
+
+AOVS = ("albedo", "roughness", "metallic", "normal", "depth", "diffuse", "specular", "alpha")
+
+
+def render_scene(path, *, view=None, turntable=None, size=None, spp=1, out=None, aovs=False, quiet=False) -> list[Path]:
+    """Render a scene of surfels into PNGs with straight alpha, and return their paths.
+
+    Args:
+      path:      a run's folder, or a scene file
+      view:      a sensor, by its id or number (default: the first)
+      turntable: instead of a view, that many frames of a camera that circles the object about the environment's
+                 up axis, at the sensors' mean distance and elevation
+      size:      width in pixels (default: the sensor's); the height follows
+      spp:       samples per pixel, a square number
+      out:       a folder, or a PNG for a single view (default: ``renders`` or ``turntable`` beside the scene)
+      aovs:      whether to write ``NAME.exr`` as well: radiance, alpha and the G-buffer, float32
+
+    Raises: UserError for bad input and where a file can't be written.
+    """
+    path = Path(path)
+    path = path / SCENE if path.is_dir() else path
+    scene = load_scene(path, {})
+    if not scene.sensors():
+        raise UserError(f"{path}: has no sensors: nothing says where to look from")
+    cameras = _circle(scene, path, turntable) if turntable else _view(scene, path, view)
+    out = Path(out) if out else path.parent / ("turntable" if turntable else "renders")
+    integrator = _integrator(scene, path) if aovs else scene.integrator()
+    written = []
+    with Progress(None, quiet or len(cameras) == 1, "rendering") as progress:
+        for k, (name, camera) in enumerate(cameras.items()):
+            if size:
+                camera = camera.resized(size, max(1, round(size * camera.size[1] / camera.size[0])))
+            file = out if out.suffix == ".png" and not turntable else out / f"{name}.png"
+            image = np.array(mi.render(scene, sensor=_sensor(camera), integrator=integrator, spp=spp))
+            write_png(file, straight(image))
+            if aovs:
+                write_exr(file.with_suffix(".exr"), image, ["R", "G", "B", "A", *integrator.aov_names()])
+            written.append(file)
+            progress.update((k + 1) / len(cameras))
+    return written
+
+
+def straight(image: np.ndarray) -> np.ndarray:
+    """[H, W, 4] display values with straight alpha from a rendering, linear and premultiplied [H, W, 4 or more]."""
+    alpha = np.clip(image[..., 3:4], 0, 1)
+    return np.concatenate([srgb_encode(np.clip(image[..., :3] / np.maximum(alpha, 1e-6), 0, 1)), alpha], -1)
+
+
+def _sensor(camera):
+    sensor = camera.to_sensor_dict()
+    sensor["film"]["pixel_format"] = "rgba"
+    return mi.load_dict(sensor)
+
+
+def _view(scene, path, view):
+    """{name: camera} of one sensor."""
+    ids = [sensor.id() for sensor in scene.sensors()]
+    number = 0 if view is None else ids.index(view) if view in ids else int(view) if view.isdigit() else -1
+    if not 0 <= number < len(ids):
+        shown = ", ".join(ids[:5]) + (", …" if len(ids) > 5 else "")
+        raise UserError(f"{path}: has no view '{view}': give a name ({shown}) or a number below {len(ids)}")
+    return {ids[number]: Camera.from_sensor(scene.sensors()[number])}
+
+
+def _circle(scene, path, frames):
+    """{'000': camera, …} around the surfels."""
+    cameras = [Camera.from_sensor(sensor) for sensor in scene.sensors()]
+    centers = np.array(mi.traverse(surfels_of(scene, path))["centers"])
+    center = np.percentile(centers, (1, 99), axis=0).mean(0)
+    up = Environment.from_emitter(scene.environment()).rotation[:, 1] if scene.environment() else np.array([0, 0, 1.0])
+    away = np.array([c.origin for c in cameras]) - center
+    distance = np.linalg.norm(away, axis=1)
+    elevation = np.arcsin(np.clip(away @ up / distance, -1, 1)).mean()
+    first = cameras[0]
+    side = np.cross(up, np.eye(3)[np.argmin(abs(up))])
+    side /= np.linalg.norm(side)
+    fov = np.degrees(2 * np.arctan(0.5 * first.size[0] / first.focal[0]))
+    circle = {}
+    for k in range(frames):
+        angle = 2 * np.pi * k / frames
+        horizontal = np.cos(angle) * side + np.sin(angle) * np.cross(up, side)
+        direction = np.cos(elevation) * horizontal + np.sin(elevation) * up
+        circle[f"{k:03}"] = Camera.look_at(center + distance.mean() * direction, center, up, fov, first.size)
+    return circle
+
+
+def _integrator(scene, path):
+    """The scene's integrator with all its AOVs."""
+    own = scene.integrator()
+    if not hasattr(own, "aov_names") or not hasattr(own, "specular"):
+        raise UserError(f"{path}: maps come from the integrator 'rgs_deferred' only: leave out --aovs")
+    return mi.load_dict({"type": "rgs_deferred", "specular": own.specular, "hide_emitters": own.hide_emitters,
+                         "aovs": ",".join(AOVS)})

@@ -1,0 +1,34 @@
+#!/usr/bin/env python
+"""Render a fitted scene from one of its views, or from a turntable."""
+
+import argparse
+from pathlib import Path
+
+import rgs_mi
+from rgs_mi.errors import run_main
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scene", type=Path, metavar="RUN_OR_SCENE.xml", help="a run's folder, or a scene")
+    views = parser.add_mutually_exclusive_group()
+    views.add_argument("--view", metavar="NAME|INDEX", help="a sensor of the scene (default: the first)")
+    views.add_argument("--turntable", type=int, metavar="N", help="N frames around the object")
+    parser.add_argument("--size", type=int, metavar="W", help="width in pixels (default: the sensor's)")
+    parser.add_argument("--spp", type=int, default=1, help="samples per pixel, a square number (default: %(default)s)")
+    parser.add_argument("--out", type=Path, metavar="FILE_OR_DIR", help="where to (default: a folder beside the scene)")
+    parser.add_argument("--aovs", action="store_true", help="write the G-buffer as well, a multichannel EXR")
+    parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
+    parser.add_argument("--quiet", action="store_true", help="no progress")
+    args = parser.parse_args()
+
+    rgs_mi.set_variant(args.variant)
+    from rgs_mi.render import render_scene
+
+    for path in render_scene(args.scene, view=args.view, turntable=args.turntable, size=args.size, spp=args.spp,
+                             out=args.out, aovs=args.aovs, quiet=args.quiet):
+        print(path)
+
+
+if __name__ == "__main__":
+    run_main(main)

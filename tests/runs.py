@@ -1,0 +1,33 @@
+"""A ball to fit in seconds, for the tests of the command line."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+TARGET = """<scene version="3.0.0">
+    <integrator type="path"> <boolean name="hide_emitters" value="true"/> </integrator>
+    <emitter type="procedural_envmap"> <string name="name" value="studio"/> <integer name="resolution" value="32"/>
+        <transform name="to_world"> <rotate x="1" angle="90"/> </transform> </emitter>
+    <shape type="sphere">
+        <bsdf type="principled"> <rgb name="base_color" value="0.6, 0.4, 0.2"/> <float name="metallic" value="1"/>
+            <float name="roughness" value="0.25"/> </bsdf>
+    </shape>
+</scene>"""
+
+
+def make_inputs(folder: Path, size=32) -> tuple[Path, Path]:
+    """Write a scene to fit (object.xml with a small environment) and photographs into ``folder``: both paths."""
+    from rgs_mi.truth import render_dataset
+
+    (folder / "ball.xml").write_text(TARGET)
+    data = render_dataset(folder / "ball.xml", folder / "ball", train=8, test=3, size=size, spp=4, quiet=True)
+    text = (ROOT / "scenes" / "object.xml").read_text()
+    (folder / "object.xml").write_text(text.replace('name="rows" value="128"', 'name="rows" value="16"'))
+    return folder / "object.xml", data
+
+
+def start_script(name, *arguments) -> subprocess.Popen:
+    """Start a script of the project in a process of its own."""
+    return subprocess.Popen([sys.executable, str(ROOT / "scripts" / name), *map(str, arguments)], text=True,
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE)
