@@ -108,7 +108,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         surfels, eta = _surfels(scene)
         filtered = self._filtered_environment(scene)
         gbuffer = render_gbuffer(surfels, camera)
-        maps = gbuffer.maps()
+        maps = gbuffer.all
         if self.specular == "none":
             image = deferred.Image(maps.diffuse, maps.diffuse, mi.Color3f(0), gbuffer)
         else:

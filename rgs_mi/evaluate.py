@@ -35,7 +35,7 @@ def render_view(surfels, filtered, camera, background) -> Rendering:
     array = lambda v: np.atleast_2d(dr.detach(v).numpy()).T.reshape(height, width, -1)
     with dr.suspend_grad():
         image = deferred.render(surfels, camera, filtered)
-        m = image.gbuffer.maps()
+        m = image.gbuffer.all
         length = dr.norm(m.normal)
         normal = dr.select(length > 0, m.normal * (m.alpha / length), 0)
         shown = losses.display(image.color, m.alpha, background)

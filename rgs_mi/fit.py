@@ -152,7 +152,7 @@ class Fit:
         offset = dr.zeros(mi.Vector2f, len(self.model))
         dr.enable_grad(offset)
         image = deferred.render(surfels, camera, filtered, offset)
-        maps = image.gbuffer.maps()
+        maps = image.gbuffer.all
         rendered = losses.display(image.color, maps.alpha, self.settings.background)
         loss = losses.photometric(rendered, target, camera.size, w.dssim)
         if w.mask > 0 and self.dataset.train[i].masked:

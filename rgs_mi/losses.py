@@ -91,7 +91,7 @@ def _interior(gbuffer):
     """Numbers of the pixels that are covered together with their four neighbours."""
     width, height = gbuffer.size
     with dr.suspend_grad():
-        alpha = gbuffer.maps().alpha
+        alpha = gbuffer.all.alpha
         dr.eval(alpha)  # a gather from a packet that is not evaluated yet crashes (Dr.Jit 1.5.0)
         index = dr.arange(mi.UInt32, width * height)
         x, y = index % width, index // width

@@ -115,6 +115,7 @@ def _loop(fit, folder, quiet) -> bool:
     checkpoint: a folder that can't be written is known before the work, not after it."""
     settings, psnr = fit.settings, None
     checkpoint.save(folder, *_state(fit, folder))
+    (folder / results.METRICS).unlink(missing_ok=True)  # from here on the run is unfinished
     saved = time.monotonic()
     planned = None if settings.iterations else max(0.0, 60 * settings.minutes - fit.elapsed)
     with GracefulInterrupt() as interrupt, Progress(planned, quiet) as progress:

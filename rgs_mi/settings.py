@@ -21,9 +21,7 @@ class Stage:
 class Start:
     """Where the fit begins."""
 
-    surfels: int = _within(12_000, 1, 10_000_000)
-    environment_rows: int = _within(128, 8, 1024)  # the map has twice as many columns
-    environment_radiance: float = _within(0.5, 1e-3, 1e3)
+    surfels: int = _within(25_000, 1, 10_000_000)
     scale: float = _within(0.8, 0.01, 10)  # standard deviation over the distance to the neighbours
 
 
@@ -51,7 +49,7 @@ class Weights:
     dssim: float = _within(0.2, 0, 1)  # of D-SSIM against L1
     mask: float = _within(0.1, 0, 1e3)
     consistency: float = _within(0.05, 0, 1e3)  # depth-normal consistency (2DGS)
-    smoothness: float = _within(0.05, 0, 1e3)  # of rendered normals
+    smoothness: float = _within(0.0, 0, 1e3)  # of rendered normals
 
 
 @dataclass(frozen=True)
@@ -64,7 +62,7 @@ class Density:
     threshold: float = _within(2e-4, 0, 1)  # positional gradient in NDC units
     dense: float = _within(0.01, 0, 1)  # surfels smaller than this (in units of the object) are cloned, others split
     prune_opacity: float = _within(0.05, 0, 1)
-    max_surfels: int = _within(40_000, 1, 10_000_000)
+    max_surfels: int = _within(50_000, 1, 10_000_000)
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,7 @@ class Settings:
     sh_start: float = _within(0.4, 0, 1)  # fraction of the fit from which view-dependent diffuse is learned
     specular: Literal["split_sum", "none"] = "split_sum"
     checkpoint_seconds: float = _within(20, 0, 1e6)
-    stages: tuple[Stage, ...] = (Stage(0.2, 4, 4), Stage(0.5, 2, 2), Stage(1.0, 1, 1))
+    stages: tuple[Stage, ...] = (Stage(0.3, 2, 1), Stage(1.0, 1, 1))
     start: Start = Start()
     rates: Rates = Rates()
     weights: Weights = Weights()

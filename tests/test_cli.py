@@ -107,7 +107,7 @@ def test_resume_after_a_crash(inputs, tmp_path, monkeypatch, capsys):
     monkeypatch.undo()
     with pytest.raises(UserError, match="--resume"):
         fit(*inputs, tmp_path)
-    assert checkpoint.load_latest(tmp_path)[1]["step"] == 12
+    assert checkpoint.load_latest(tmp_path)[1]["step"] == 12 and not (tmp_path / "metrics.json").exists()
     fit(*inputs, tmp_path, overrides=[*SMALL, "weights.mask=0.2"], resume=True)
     assert metrics(tmp_path)["iterations"] == 20
     assert "weights.mask 0.1 -> 0.2" in capsys.readouterr().err
@@ -199,3 +199,17 @@ def test_mistakes(inputs, tmp_path):
         out, error = process.communicate(timeout=60)
         assert process.returncode == 2, (text, out, error)
         assert error.startswith("error: ") and len(error.splitlines()) == 1 and text in error, (text, error)
+
+
+def test_benchmark(tmp_path, capsys):
+    from rgs_mi import benchmark
+
+    other = tmp_path / "other.py"
+    other.write_text("for name in ('lists', 'forward', 'backward'): print(f'{name:10s} 1000.0 ms  (first call 1 ms)')")
+    benchmark.splat(500, 64, other, rounds=1)
+    rows = {line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines()[2:]}
+    assert list(rows) == ["lists", "forward", "backward", "total"]
+    assert float(rows["total"][1]) == 3000 and all(float(r[0]) > 0 for r in rows.values())
+    other.write_text("print('forward 1.0 ms')")
+    with pytest.raises(UserError, match="no time of 'lists'"):
+        benchmark.splat(500, 64, other, rounds=1)

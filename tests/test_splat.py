@@ -19,7 +19,7 @@ SMOOTH = Cutoffs(alpha_min=1e-7, alpha_max=0.9999, transmittance_min=0)
 
 
 def render_gbuffer(surfels, camera, cutoffs=Cutoffs()):
-    return gbuffer.render_gbuffer(surfels, camera, cutoffs=cutoffs).maps()
+    return gbuffer.render_gbuffer(surfels, camera, cutoffs=cutoffs).all
 
 
 def stacked(maps):

@@ -35,8 +35,8 @@ def pixel_directions(camera, index):
 def shade(gbuffer, camera, filtered, eta=split_sum.DEFAULT_ETA) -> Image:
     """Shade a G-buffer under a `FilteredEnvironment`. Only covered pixels are computed."""
     pixels = camera.size[0] * camera.size[1]
-    diffuse = gbuffer.maps().diffuse
-    index = dr.compress(dr.detach(gbuffer.maps().alpha) > COVERED)
+    diffuse = gbuffer.all.diffuse
+    index = dr.compress(dr.detach(gbuffer.all.alpha) > COVERED)
     specular = dr.zeros(mi.Color3f, pixels)
     if dr.width(index) > 0:
         m = gbuffer.maps(index)

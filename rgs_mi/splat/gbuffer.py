@@ -1,5 +1,6 @@
 """The G-buffer: all maps of a view from one walk (`method.md` §2)."""
 
+import functools
 from dataclasses import dataclass
 
 import drjit as dr
@@ -40,10 +41,13 @@ class GBuffer:
     image: "mi.Float"
     seen: "mi.Bool"
 
-    def maps(self, index=None) -> Maps:
-        """The maps at pixels number ``index``, or everywhere."""
-        if index is None:
-            index = dr.arange(mi.UInt32, self.size[0] * self.size[1])
+    @functools.cached_property
+    def all(self) -> Maps:
+        """The maps of every pixel."""
+        return self.maps(dr.arange(mi.UInt32, self.size[0] * self.size[1]))
+
+    def maps(self, index) -> Maps:
+        """The maps at pixels number ``index``."""
         m = [v for q in range(4) for v in dr.gather(mi.Vector4f, self.image, index * 4 + q)]
         return Maps(mi.Color3f(*m[0:3]), mi.Vector3f(*m[3:6]), mi.Color3f(*m[6:9]), m[9], m[10], mi.Vector3f(*m[11:14]),
                     m[14], m[15])
