@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import losses
+from .aligned import lanes
 from .color import display
 from .density import Gradients, densify
 from .model import ENVIRONMENT, Model
@@ -41,7 +42,7 @@ class Photographs:
             window = whole[y:y + height, x:x + width].transpose(2, 0, 1).reshape(4, -1)
             self._images[i] = np.ascontiguousarray(window).astype(np.float16), whole.shape[1::-1]
         planes, size = self._images[i]
-        planes = [mi.Float(plane.astype(np.float32)) for plane in planes]
+        planes = [lanes(plane) for plane in planes]
         color = mi.Color3f(*planes[:3]) + self.background * (1 - planes[3])
         return view.camera.resized(*size).cropped(x, y, width, height), color, planes[3], size
 
@@ -96,7 +97,7 @@ class Fit:
         """The fit whose `state` this was."""
         fit = cls(dataset, Model.from_state(arrays), settings, meta["extent"])
         fit.step_number, fit.views_used, fit.elapsed = meta["step"], meta["views_used"], meta["elapsed"]
-        fit.gradients.sum, fit.gradients.count = (mi.Float(arrays[f"gradient_{k}"]) for k in ("sum", "count"))
+        fit.gradients.sum, fit.gradients.count = (lanes(arrays[f"gradient_{k}"]) for k in ("sum", "count"))
         return fit
 
     @property

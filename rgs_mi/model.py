@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .aligned import lanes, tensor
 from .shading.environment import Environment
 from .surfel import Surfels
 
@@ -36,7 +37,7 @@ class Model:
         self.rotation, self.two_sided = np.asarray(rotation, np.float64), bool(two_sided)
         self.optimizer = mi.ad.Adam(lr=1e-3, epsilon=_EPSILON)
         for name, value in parameters.items():
-            self.optimizer[name] = mi.TensorXf(np.ascontiguousarray(value, np.float32))
+            self.optimizer[name] = tensor(value)
 
     @classmethod
     def start(cls, positions, normals, colors, spacing, environment, rotation, sh_order, seed=0, scale=1.0):
@@ -93,7 +94,7 @@ class Model:
         """Replace a parameter; its moments start again from zero, or stay where ``reset`` is off (same shape)."""
         moments = self.optimizer.state[name][3]
         del self.optimizer[name]
-        self.optimizer[name] = mi.TensorXf(np.ascontiguousarray(value, np.float32))
+        self.optimizer[name] = tensor(value)
         if not reset:
             self._set_moments(name, *moments[:3])
 
@@ -106,7 +107,7 @@ class Model:
             t, m, v, _ = self.optimizer.state[name][3]
             moments = [x.numpy().reshape(value.shape)[index] * ~fresh[:, None] for x in (m, v)]
             self.set(name, changes.get(name, value[index]))
-            self._set_moments(name, t, *(mi.Float(x.ravel().astype(np.float32)) for x in moments))
+            self._set_moments(name, t, *map(lanes, moments))
 
     def _set_moments(self, name, t, m, v):
         value, promoted, lr, _ = self.optimizer.state[name]
@@ -129,5 +130,5 @@ class Model:
         names = [*SURFEL_PARAMETERS, ENVIRONMENT]
         model = cls({name: arrays[name] for name in names}, arrays["rotation"], arrays["two_sided"])
         for name in names:
-            model._set_moments(name, mi.UInt32(int(arrays[f"{name}.t"])), *(mi.Float(arrays[f"{name}.{k}"]) for k in "mv"))
+            model._set_moments(name, mi.UInt32(int(arrays[f"{name}.t"])), *(lanes(arrays[f"{name}.{k}"]) for k in "mv"))
         return model

@@ -15,10 +15,10 @@ import functools
 from dataclasses import dataclass
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 from scipy import fft
 
+from ..aligned import lanes
 from .tables import lobe
 
 #: Roughness of each level and the rows of its map; None: the environment's own. Level 0 is the mirror: no filter.
@@ -142,11 +142,11 @@ class _Apply(dr.CustomOp):
 
     def backward(self):
         adjoint = np.ascontiguousarray(self.grad_out().numpy().reshape(-1, 4)[:, :3])
-        self.set_grad_in("texels", mi.Float(self.operator.transpose(adjoint).astype(np.float32).ravel()))
+        self.set_grad_in("texels", lanes(self.operator.transpose(adjoint)))
 
     @staticmethod
     def _pad(values):
-        return mi.Float(np.pad(values.astype(np.float32), ((0, 0), (0, 1))).ravel())
+        return lanes(np.pad(values, ((0, 0), (0, 1))))
 
     def name(self):
         return "rgs_mi.shading.Prefilter"
