@@ -137,7 +137,8 @@ class Fit:
         surfels, filtered = Surfels(*leaves[:-1], surfels.two_sided), replace(filtered, texels=leaves[-1])
         errors = [self._view(i, surfels, filtered, 1 / len(views)) for i in views]
         for value, leaf in zip(shared, leaves):
-            dr.set_grad(value, dr.grad(leaf))
+            gradient = dr.grad(leaf)
+            dr.set_grad(value, dr.select(dr.isfinite(gradient), gradient, 0))  # one overflow must not end a fit
             dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
         self.model.optimizer.step()

@@ -14,6 +14,8 @@ SURFEL_PARAMETERS = ("centers", "rotations", "log_scales", "logit_opacities", "s
 ENVIRONMENT = "log_environment"
 #: The step of 3DGS's optimisers is relative to the gradient's own size, however small.
 _EPSILON = 1e-15
+_LOG_RADIANCE = (-9.0, 8.0)  # texels that no ray tells apart would else drift to overflow
+_LEAST_SCALE = 1e-6  # world units: smaller surfels overflow on the screen
 
 
 def logit(p, margin=1e-4):
@@ -76,13 +78,13 @@ class Model:
         sh = p["sh_dc"]
         if sh_order > 0:
             sh = dr.concat((sh, p["sh_rest"][:, : 3 * ((sh_order + 1) ** 2 - 1)]), axis=1)
-        return Surfels(p["centers"], p["rotations"], dr.exp(p["log_scales"]), _sigmoid(p["logit_opacities"]), sh,
+        return Surfels(p["centers"], p["rotations"], dr.maximum(dr.exp(p["log_scales"]), _LEAST_SCALE), _sigmoid(p["logit_opacities"]), sh,
                        _sigmoid(p["logit_base_color"]), _sigmoid(p["logit_roughness"]), _sigmoid(p["logit_metallic"]),
                        p["delta_normal"], self.two_sided)
 
     def environment(self) -> Environment:
         """The environment, non-negative by construction."""
-        return Environment(dr.exp(self.optimizer[ENVIRONMENT]), self.rotation)
+        return Environment(dr.exp(dr.clip(self.optimizer[ENVIRONMENT], *_LOG_RADIANCE)), self.rotation)
 
     # ---- Surgery ----
 

@@ -23,6 +23,7 @@ from .project import GEOMETRY
 from .tiles import LOW_PASS, Cutoffs, lane_pixels
 
 PACKET = 4  # floats per gather and scatter
+HORIZON = 1e-5  # least h of (1): beyond it a ray runs along the surfel's plane, or meets it behind the camera
 
 
 @dataclass(frozen=True)
@@ -69,10 +70,12 @@ class _Hit:
     def __init__(self, record, x, y, cutoffs):
         X, Y, A_x, A_y, B_x, B_y, N_x, N_y, z, opacity = record[:len(GEOMETRY)]
         self.dx, self.dy = x - X, y - Y
-        self.inv_h = dr.rcp(1 + N_x * self.dx + N_y * self.dy)
+        h = 1 + N_x * self.dx + N_y * self.dy
+        in_front = h > HORIZON
+        self.inv_h = dr.rcp(dr.select(in_front, h, 1))
         self.u = (A_x * self.dx + A_y * self.dy) * self.inv_h
         self.v = (B_x * self.dx + B_y * self.dy) * self.inv_h
-        on_plane = dr.select(self.inv_h > 0, self.u * self.u + self.v * self.v, dr.largest(mi.Float))
+        on_plane = dr.select(in_front, self.u * self.u + self.v * self.v, dr.largest(mi.Float))
         on_screen = LOW_PASS * (self.dx * self.dx + self.dy * self.dy)
         self.on_plane = on_plane <= on_screen  # else the low-pass decides, and the depth is the centre's
         self.gauss = dr.exp(-0.5 * dr.minimum(on_plane, on_screen))
