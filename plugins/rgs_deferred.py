@@ -109,10 +109,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         filtered = self._filtered_environment(scene)
         gbuffer = render_gbuffer(surfels, camera)
         maps = gbuffer.all
-        if self.specular == "none":
-            image = deferred.Image(maps.diffuse, maps.diffuse, mi.Color3f(0), gbuffer)
-        else:
-            image = deferred.shade(gbuffer, camera, filtered, eta)
+        image = deferred.shade(gbuffer, camera, None if self.specular == "none" else filtered, eta)
         rays = deferred.pixel_directions(camera, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]))
         color, alpha = image.color, maps.alpha
         if not self.hide_emitters and filtered is not None:

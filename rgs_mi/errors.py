@@ -1,6 +1,7 @@
 """The one exception that reaches a person: a single line that names the file and the remedy."""
 
 import sys
+import warnings
 
 
 class UserError(Exception):
@@ -8,12 +9,19 @@ class UserError(Exception):
 
 
 def run_main(main):
-    """Call ``main()`` as a command: a ``UserError`` prints one line and exits with 2, Ctrl-C with 130."""
-    try:
-        sys.exit(main())
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(130)
+    """Call ``main()`` as a command: a ``UserError`` prints one line and exits with 2, Ctrl-C with 130; warnings print one
+    line each."""
+    with warnings.catch_warnings():
+        warnings.showwarning = _print_warning
+        try:
+            sys.exit(main())
+        except UserError as error:
+            print(f"error: {error}", file=sys.stderr)
+            sys.exit(2)
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            sys.exit(130)
+
+
+def _print_warning(message, *_, **__):
+    print("warning:", *str(message).split(), file=sys.stderr)

@@ -13,6 +13,7 @@ from .color import display
 from .density import Gradients, densify
 from .model import ENVIRONMENT, Model
 from .shading import deferred
+from .shading.split_sum import DEFAULT_ETA
 from .surfel import CHANNELS, Surfels
 
 #: Rate of each parameter: the field of `Rates` that it obeys.
@@ -74,12 +75,13 @@ def _shrink(image, factor):
 class Fit:
     """A fit in progress: the model, how far it is, and one method a step.
 
-    ``settings``: `Settings`. ``extent``: radius of the object in world units. ``elapsed``: seconds spent so far, earlier
-    sessions included.
+    ``settings``: `Settings`. ``extent``: radius of the object in world units. ``specular``, ``eta``: how the scene is
+    shaded (see `FitScene`). ``elapsed``: seconds spent so far, earlier sessions included.
     """
 
-    def __init__(self, dataset, model: Model, settings, extent: float):
+    def __init__(self, dataset, model: Model, settings, extent: float, specular="split_sum", eta=DEFAULT_ETA):
         self.dataset, self.model, self.settings, self.extent = dataset, model, settings, extent
+        self.specular, self.eta = specular, eta
         self.step_number, self.views_used, self.elapsed = 0, 0, 0.0
         self.gradients = Gradients(len(model))
         self.photographs = None
@@ -93,9 +95,9 @@ class Fit:
                         "extent": self.extent}
 
     @classmethod
-    def resume(cls, dataset, settings, arrays: dict, meta: dict) -> "Fit":
-        """The fit whose `state` this was."""
-        fit = cls(dataset, Model.from_state(arrays), settings, meta["extent"])
+    def resume(cls, dataset, settings, arrays: dict, meta: dict, **shading) -> "Fit":
+        """The fit whose `state` this was. ``shading``: ``specular`` and ``eta``."""
+        fit = cls(dataset, Model.from_state(arrays), settings, meta["extent"], **shading)
         fit.step_number, fit.views_used, fit.elapsed = meta["step"], meta["views_used"], meta["elapsed"]
         fit.gradients.sum, fit.gradients.count = (lanes(arrays[f"gradient_{k}"]) for k in ("sum", "count"))
         return fit
@@ -119,6 +121,10 @@ class Fit:
             return 0
         return min(s.sh_order, 1 + int((self.progress - s.sh_start) / (1 - s.sh_start + 1e-9) * s.sh_order))
 
+    def filtered(self):
+        """The model's environment as shading takes it: None where nothing specular is shaded."""
+        return None if self.specular == "none" else self.model.environment().filtered()
+
     def step(self):
         """One step of the optimiser on the next few views, and density control when it is due."""
         start = time.monotonic()
@@ -127,14 +133,15 @@ class Fit:
             self.photographs = Photographs(self.dataset.train, stage.downscale, s.background)
         self._set_rates()
         views = self._next_views(stage.views)
-        filtered = self.model.environment().filtered()
+        filtered = self.filtered()
         surfels = self.model.surfels(self.sh_order)
         # The views share what lies before them: their gradients meet in leaves there, and go the rest of the way once.
-        shared = [*(getattr(surfels, name) for name in CHANNELS), filtered.texels]
+        shared = [*(getattr(surfels, name) for name in CHANNELS), *([filtered.texels] if filtered else [])]
         leaves = [type(v)(dr.detach(v)) for v in shared]
         dr.eval(leaves)
         dr.enable_grad(leaves)
-        surfels, filtered = Surfels(*leaves[:-1], surfels.two_sided), replace(filtered, texels=leaves[-1])
+        surfels = Surfels(*leaves[:len(CHANNELS)], surfels.two_sided)
+        filtered = filtered and replace(filtered, texels=leaves[-1])
         errors = [self._view(i, surfels, filtered, 1 / len(views)) for i in views]
         for value, leaf in zip(shared, leaves):
             gradient = dr.grad(leaf)
@@ -153,7 +160,7 @@ class Fit:
         w = self.settings.weights
         offset = dr.zeros(mi.Vector2f, len(self.model))
         dr.enable_grad(offset)
-        image = deferred.render(surfels, camera, filtered, offset)
+        image = deferred.render(surfels, camera, filtered, offset, self.eta)
         maps = image.gbuffer.all
         rendered = losses.display(image.color, maps.alpha, self.settings.background)
         loss = losses.photometric(rendered, target, camera.size, w.dssim)

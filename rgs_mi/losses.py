@@ -8,6 +8,8 @@ from .shading.deferred import COVERED
 from .splat.project import opaque
 
 SATURATED = 0.995  # display value from which a photograph only says "at least this bright"
+CREASE = 0.1  # difference of unit normals from pixel to pixel that counts as an edge
+JUMP = 0.05  # 1 − cosine between rendered and depth normal that counts as a jump in depth
 _WINDOW, _SIGMA = 11, 1.5  # SSIM's Gaussian window
 _C1, _C2 = 0.01**2, 0.03**2
 
@@ -118,16 +120,19 @@ def depth_normal_consistency(gbuffer, camera):
 
     n_depth = dr.normalize(dr.cross(point(index + width) - point(index - width), point(index + 1) - point(index - 1)))
     n = dr.normalize(R @ gbuffer.maps(index).normal)
-    return dr.sum(1 - dr.dot(n, n_depth)) / (width * height)
+    difference = 1 - dr.dot(n, n_depth)
+    return dr.sum(difference / (1 + difference / JUMP)) / (width * height)
 
 
 def normal_smoothness(gbuffer):
-    """Mean over the covered pixels of the squared forward differences of N (RGS, L_normal, before its mask)."""
+    """Mean over the covered pixels of the squared forward differences of N (RGS, L_normal, before its mask), each limited
+    by d² / (1 + d²/CREASE²): noise of a few degrees is smoothed, an edge of the object is let be."""
     width, height = gbuffer.size
     index = _interior(gbuffer)
     if dr.width(index) == 0:
         return mi.Float(0)
     normal = lambda i: gbuffer.maps(i).normal
     here = normal(index)
-    difference = dr.squared_norm(normal(index + 1) - here) + dr.squared_norm(normal(index + width) - here)
+    limited = lambda d2: d2 / (1 + d2 / CREASE**2)
+    difference = sum(limited(dr.squared_norm(normal(index + step) - here)) for step in (1, width))
     return dr.sum(difference) * dr.opaque(mi.Float, 1 / dr.width(index))  # a literal would recompile at every count

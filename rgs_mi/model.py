@@ -78,7 +78,8 @@ class Model:
         sh = p["sh_dc"]
         if sh_order > 0:
             sh = dr.concat((sh, p["sh_rest"][:, : 3 * ((sh_order + 1) ** 2 - 1)]), axis=1)
-        return Surfels(p["centers"], p["rotations"], dr.maximum(dr.exp(p["log_scales"]), _LEAST_SCALE), _sigmoid(p["logit_opacities"]), sh,
+        scales = dr.maximum(dr.exp(p["log_scales"]), _LEAST_SCALE)
+        return Surfels(p["centers"], p["rotations"], scales, _sigmoid(p["logit_opacities"]), sh,
                        _sigmoid(p["logit_base_color"]), _sigmoid(p["logit_roughness"]), _sigmoid(p["logit_metallic"]),
                        p["delta_normal"], self.two_sided)
 

@@ -25,6 +25,7 @@ class Progress:
 
     Args:
       total: planned wall-clock seconds, from which the time left follows; None to extrapolate it from the fraction done
+             since the first update
       quiet: show nothing
       label: what is going on
     """
@@ -33,6 +34,7 @@ class Progress:
         self.total, self.quiet, self.label = total, quiet, label
         self.fraction, self.fields = 0.0, {}
         self._live = None
+        self._first = None  # time and fraction of the first update
 
     def __enter__(self):
         self._start = self._printed = time.monotonic()
@@ -47,6 +49,7 @@ class Progress:
         """Set the fraction done, in [0, 1], and what else to tell. ``psnr`` (dB), ``surfels``, ``ms`` (a step) and
         ``pixels`` have their own words; other fields read 'name value'. A field stays until it is given again."""
         self.fraction = min(max(float(fraction), 0.0), 1.0)
+        self._first = self._first or (time.monotonic(), self.fraction)
         self.fields |= fields
         if not self._live and time.monotonic() - self._printed >= PLAIN_INTERVAL:
             self._print()
@@ -78,7 +81,9 @@ class Progress:
             return [f"took {_clock(elapsed)}"]
         if self.total is not None:
             return [f"{_clock(max(self.total - elapsed, 0))} left"]
-        return [f"{_clock(elapsed / self.fraction - elapsed)} left"] if self.fraction else []
+        begin, before = self._first or (self._start, 0.0)  # a resumed fit begins with something done
+        done = self.fraction - before
+        return [f"{_clock((time.monotonic() - begin) / done * (1 - self.fraction))} left"] if done > 0 else []
 
 
 def _plain(value):

@@ -9,9 +9,9 @@ from .camera import Camera
 from .color import srgb_encode
 from .errors import UserError
 from .export import SCENE, write_exr
+from .load import load_scene, surfels_of
 from .pictures import write_png
 from .progress import Progress
-from .scene import load_scene, surfels_of
 from .shading.environment import Environment
 
 AOVS = ("albedo", "roughness", "metallic", "normal", "depth", "diffuse", "specular", "alpha")

@@ -33,18 +33,18 @@ def write(fit, scene, folder, quiet):
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
         exported = export(folder, scene, surfels, environment, views)
-        filtered = environment.filtered()
+        filtered = fit.filtered()
     scores, rows = {}, []
     on_sheet = {int(k) for k in np.linspace(0, len(views) - 1, SHEET_ROWS + 2)[1:-1].round()}
     with Progress(None, quiet, "evaluating") as progress:
         for k, view in enumerate(views):
-            rendering = evaluate.render_view(surfels, filtered, view.camera, background)
+            rendering = evaluate.render_view(surfels, filtered, view.camera, background, fit.eta)
             pictures.write_view(folder / "test", view, rendering, background, gbuffer=k < GBUFFERS)
             scores[view.name] = evaluate.score(view, rendering, background)
             if k in on_sheet:
                 rows.append((view, rendering))
             progress.update((k + 1) / len(views))
-    fps = evaluate.frames_per_second(surfels, filtered, [view.camera for view in views])
+    fps = evaluate.frames_per_second(surfels, filtered, [view.camera for view in views], fit.eta)
     mean = evaluate.mean_scores(list(scores.values()) if held_out else [])
     figures = _figures(fit, mean, fps) | {"views": scores if held_out else {}}
     with checkpoint.atomic_file(folder / METRICS) as stream:

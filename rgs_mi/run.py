@@ -41,7 +41,7 @@ def optimize(path, *, data=None, variables=None, config=None, overrides=(), minu
     folder = Path(out) if out else Path("runs") / scene.name
     saved = _saved(folder, resume)
     dataset = scene.dataset(quiet)
-    fit = _resume(saved, dataset, settings) if saved else start(scene, dataset, settings)
+    fit = _resume(saved, scene, dataset, settings) if saved else start(scene, dataset, settings)
     stopped = _loop(fit, folder, quiet)
     results.write(fit, scene, folder, quiet)
     if stopped:
@@ -72,10 +72,10 @@ def start(scene, dataset, settings) -> Fit:
     light = scene.environment
     model = Model.start(positions, normals, colors, spacing, light.texels.numpy(), light.rotation, settings.sh_order,
                         settings.seed, settings.start.scale)
-    return Fit(dataset, model, settings, extent)
+    return Fit(dataset, model, settings, extent, scene.specular, scene.eta)
 
 
-def _resume(saved, dataset, settings) -> Fit:
+def _resume(saved, scene, dataset, settings) -> Fit:
     """The fit of a checkpoint, under ``settings``; tells which differ from those that it was saved with."""
     arrays, meta = saved
     if meta["photographs"] != _photographs(dataset):
@@ -87,7 +87,7 @@ def _resume(saved, dataset, settings) -> Fit:
     if changed:
         listing = ", ".join(f"{key} {old.get(key)} -> {new[key]}" for key in changed)
         print(f"settings differ from the checkpoint's, the new ones hold: {listing}", file=sys.stderr)
-    return Fit.resume(dataset, settings, arrays, meta)
+    return Fit.resume(dataset, settings, arrays, meta, specular=scene.specular, eta=scene.eta)
 
 
 def _photographs(dataset) -> list:

@@ -1,15 +1,13 @@
 """What there is to fit: a Mitsuba scene whose surfels name photographs, and the YAML beside it that says how."""
 
-import re
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 
-import mitsuba as mi
-
 from .camera import Camera
 from .config import load_config
 from .errors import UserError
+from .load import load_scene, surfels_of
 from .settings import Settings
 from .shading.environment import Environment
 from .truth import render_dataset
@@ -17,30 +15,6 @@ from .views import Dataset, load_dataset
 
 RENDERED = Path("data")  # photographs of path-traced scenes are kept here, below the current folder
 _ENVIRONMENTS = ("envmap", "procedural_envmap", "constant")
-
-
-def load_scene(path, variables: dict):
-    """``mi.load_file``. Raises: UserError, in one line, for whatever is wrong with the scene."""
-    if not Path(path).is_file():
-        raise UserError(f"no scene at {path}: check the path")
-    try:
-        return mi.load_file(str(path), **variables)
-    except UserError:
-        raise
-    except Exception as error:  # Mitsuba wraps what a plugin raises, its traceback included
-        text = str(error)
-        if "UserError: " in text:
-            text = text.rpartition("UserError: ")[2]
-        text = " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\] ", "", text).split())
-        raise UserError(f"{path}: {text}") from error
-
-
-def surfels_of(scene, path):
-    """The scene's one `surfels` shape. Raises: UserError where there is none, or more."""
-    found = [shape for shape in scene.shapes() if hasattr(shape, "photographs")]
-    if len(found) != 1:
-        raise UserError(f"{path}: has {len(found)} shapes of type 'surfels': a scene to fit has exactly one")
-    return found[0]
 
 
 def _parse(path):
@@ -54,13 +28,16 @@ def _parse(path):
 @dataclass(frozen=True)
 class FitScene:
     """A scene to fit: the XML ``path`` and its ``root`` element, the ``variables`` it was loaded with, where its
-    ``photographs`` are (a folder, or a scene to render them from), and the ``environment`` to start from."""
+    ``photographs`` are (a folder, or a scene to render them from), the ``environment`` to start from, and how it is
+    shaded: the integrator's ``specular`` and the index of refraction ``eta`` of the surfels."""
 
     path: Path
     root: ET.Element
     variables: dict
     photographs: Path
     environment: Environment
+    specular: str
+    eta: float
 
     @classmethod
     def load(cls, path, data=None, variables=None) -> "FitScene":
@@ -73,9 +50,11 @@ class FitScene:
         if data is not None:
             variables["data"] = str(Path(data).absolute())
         scene = load_scene(path, variables)
-        photographs = surfels_of(scene, path).photographs
-        if not photographs:
+        surfels, integrator = surfels_of(scene, path), scene.integrator()
+        if not surfels.photographs:
             raise UserError(f"{path}: no photographs are named: give a capture's folder with --data")
+        if not hasattr(integrator, "specular"):
+            raise UserError(f"{path}: its integrator is a {integrator.class_name()}: surfels need 'rgs_deferred'")
         for sensor in scene.sensors():
             Camera.from_sensor(sensor)
         if scene.environment() is None:
@@ -83,7 +62,8 @@ class FitScene:
         root = _parse(path)
         if cls.surfels_element(root) is None or cls.emitter_element(root) is None:
             raise UserError(f"{path}: surfels and environment must stand in this file, not in one it includes")
-        return cls(path, root, variables, Path(photographs), Environment.from_emitter(scene.environment()))
+        return cls(path, root, variables, Path(surfels.photographs), Environment.from_emitter(scene.environment()),
+                   integrator.specular, surfels.eta)
 
     @staticmethod
     def surfels_element(root):

@@ -1,7 +1,6 @@
 """How to fit: every number of the schedule, with defaults that suit two CPU cores. YAML files and --set change them."""
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 
 def _within(default, low, high):
@@ -48,8 +47,8 @@ class Weights:
 
     dssim: float = _within(0.2, 0, 1)  # of D-SSIM against L1
     mask: float = _within(0.1, 0, 1e3)
-    consistency: float = _within(0.05, 0, 1e3)  # depth-normal consistency (2DGS)
-    smoothness: float = _within(0.0, 0, 1e3)  # of rendered normals
+    consistency: float = _within(0.1, 0, 1e3)  # depth-normal consistency (2DGS)
+    smoothness: float = _within(0.1, 0, 1e3)  # of rendered normals
 
 
 @dataclass(frozen=True)
@@ -75,9 +74,8 @@ class Settings:
     background: float = _within(1.0, 0, 1)  # display grey level behind masked objects, in training and in figures
     sh_order: int = _within(2, 0, 3)
     sh_start: float = _within(0.4, 0, 1)  # fraction of the fit from which view-dependent diffuse is learned
-    specular: Literal["split_sum", "none"] = "split_sum"
     checkpoint_seconds: float = _within(20, 0, 1e6)
-    stages: tuple[Stage, ...] = (Stage(0.3, 2, 1), Stage(1.0, 1, 1))
+    stages: tuple[Stage, ...] = (Stage(0.2, 2, 1), Stage(1.0, 1, 1))
     start: Start = Start()
     rates: Rates = Rates()
     weights: Weights = Weights()

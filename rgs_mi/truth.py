@@ -25,6 +25,7 @@ import numpy as np
 
 from .camera import Camera
 from .errors import UserError
+from .load import load_scene
 
 FOV = 39.6                  # degrees, Blender's default camera (0.691 rad)
 MARGIN = 1.02               # keeps the object's bounding sphere off the frame
@@ -199,18 +200,6 @@ def _code_digest() -> str:
     return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()
 
 
-def _load(xml: Path, variables: dict):
-    import mitsuba as mi
-
-    try:
-        return mi.load_file(str(xml), **{k: str(v) for k, v in variables.items()})
-    except UserError:
-        raise
-    except Exception as error:      # Mitsuba raises RuntimeError, ValueError, and what a Python plugin raises, wrapped
-        lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-        raise UserError(f"cannot load {xml}: {' '.join(lines)}") from error
-
-
 def _prepare(out: Path, key: dict) -> bool:
     """Make ``out`` ready for a data set with the given key; True when it is already complete.
 
@@ -281,7 +270,7 @@ def render_dataset(xml, out, *, train: int = 60, test: int = 20, size: int = 400
     if _prepare(out, key):
         return out
 
-    scene = _load(xml, variables)
+    scene = load_scene(xml, variables)
     try:
         center, extent = bounds(scene)
     except UserError as error:

@@ -71,12 +71,48 @@ def test_exported_scene_renders_the_same(run):
     np.testing.assert_array_equal(np.array(mi.traverse(scene)["environment.data"])[:, 1:-1],
                                   np.array(mi.Bitmap(str(run / "environment.exr"))))
     assert len(scene.sensors()) == 3
+    assert_renders_as_written(scene, run)
+
+
+def assert_renders_as_written(scene, run):
+    """Mitsuba's images of the exported scene are those that the metrics are of."""
     for k, sensor in enumerate(scene.sensors()):
         image = np.array(mi.render(scene, sensor=k))
         color = mi.Color3f(np.ascontiguousarray(image[..., :3].reshape(-1, 3).T))
         shown = losses.display(color, mi.Float(image[..., 3].ravel()), 1.0).numpy().T.reshape(*image.shape[:2], 3)
         written = np.asarray(Image.open(run / "test" / f"{sensor.id()}.png")) / 255
         assert abs(np.clip(shown, 0, 1) - written).max() < 1 / 255
+
+
+@pytest.mark.parametrize("old, new", [
+    ('type="rgs_deferred">', 'type="rgs_deferred"><string name="specular" value="none"/>'),
+    ('<bsdf type="principled" id="material"/>', '<bsdf type="principled"><float name="eta" value="2.5"/></bsdf>')])
+def test_shading_is_the_scenes(inputs, tmp_path, old, new):
+    scene, data = inputs
+    other = tmp_path / "other.xml"
+    other.write_text(scene.read_text().replace(old, new))
+    folder = fit(other, data, tmp_path / "run", overrides=[*SMALL, "iterations=3"])
+    assert_renders_as_written(mi.load_file(str(folder / "scene.xml")), folder)
+
+
+def test_photographs_without_masks(inputs, tmp_path):
+    """RGB files: the fit starts from random points."""
+    scene, data = inputs
+    for path in data.glob("transforms_*.json"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    for path in data.glob("*/r_*[0-9].png"):
+        (tmp_path / path.parent.name).mkdir(exist_ok=True)
+        white = Image.new("RGBA", Image.open(path).size, "white")
+        white.alpha_composite(Image.open(path))
+        white.convert("RGB").save(tmp_path / path.parent.name / path.name)
+    process = start_script("optimize.py", scene, "--data", tmp_path, "--out", tmp_path / "run", "--quiet",
+                           *(word for setting in [*SMALL, "iterations=30", "density.interval=10", "density.start=0",
+                                                  "sh_start=0.2"] for word in ("--set", setting)))
+    _, error = process.communicate(timeout=100)
+    assert process.returncode == 0 and error == "", error
+    figures = metrics(tmp_path / "run")
+    assert figures["finished"] and figures["psnr"] > 8 and figures["normal_mae_deg"] is None
+    assert_renders_as_written(mi.load_file(str(tmp_path / "run" / "scene.xml")), tmp_path / "run")
 
 
 def test_render(run, tmp_path):
@@ -191,6 +227,7 @@ def test_mistakes(inputs, tmp_path):
         "malformed YAML": [scene, "--data", data, "--config", write("bad.yaml", "density: [1, ")],
         "did you mean": [scene, "--data", data, "--set", "densty.start=0.1"],
         "'flat' is a OrthographicCamera": [write("flat.xml", sensor), "--data", data],
+        "integrator is a": [write("path.xml", scene.read_text().replace("rgs_deferred", "path")), "--data", data],
         "write name=value": [scene, "--data", data, "-D", "width"],
         "can't be written": [scene, "--data", data, "--out", scene / "run"],
     }

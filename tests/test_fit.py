@@ -14,6 +14,7 @@ from rgs_mi.fit import Fit, Photographs
 from rgs_mi.model import Model
 from rgs_mi.settings import Density, Settings, Stage, Start
 from rgs_mi.shading import deferred
+from rgs_mi.shading.environment import Environment
 from rgs_mi.surfel import Surfels
 from rgs_mi.views import Dataset, View
 
@@ -75,6 +76,19 @@ def test_a_fit_gets_better(dataset):
         fit.step()
     assert fit.psnr > first + 2
     assert fit.views_used == fit.step_number == 40
+
+
+def test_without_specular_the_environment_stays(dataset, monkeypatch):
+    monkeypatch.setattr(Environment, "filtered", None)  # nothing asks for it
+    fit = Fit(dataset, model(), SETTINGS, 1.0, specular="none")
+    before = {name: fit.model.numpy(name) for name in ("log_environment", "sh_dc", "centers")}
+    for _ in range(10):
+        fit.step()
+    same = {name: np.array_equal(value, fit.model.numpy(name)) for name, value in before.items()}
+    assert same == {"log_environment": True, "sh_dc": False, "centers": False}
+    again = Fit.resume(dataset, SETTINGS, *fit.state(), specular="none")
+    again.step()
+    assert np.isfinite(again.psnr)
 
 
 def test_every_view_is_used_once_a_round(dataset):

@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 from scipy import ndimage, spatial
 
+from rgs_mi import truth
 from rgs_mi.camera import Camera
 from rgs_mi.errors import UserError
 from rgs_mi.initial import initial_points
@@ -123,6 +124,39 @@ def test_coarse_to_fine_skips_nothing(data):
     np.testing.assert_allclose(field.values[1:-1, 1:-1, 1:-1][close], full[close], atol=1e-3 * field.step)
 
 
+@pytest.mark.parametrize("size", [32, 100])
+@pytest.mark.parametrize("count, peak", [(8, 1.12), (16, 1.06), (30, 1.03)])  # cones of few views leave peaks
+@pytest.mark.parametrize("centre", [(0, 0, 0), (400, -300, 250)])
+def test_object_that_fills_the_frame(size, count, peak, centre):
+    """As `rgs_mi.truth` photographs objects: space that no frame shows is carved all the same."""
+    centre, distance = np.array(centre, float), truth.MARGIN / np.sin(np.radians(truth.FOV / 2))
+    views = views_of([Camera.look_at(centre + distance * d, centre, (0, 0, 1), truth.FOV, (size, size))
+                      for d in truth.train_directions(count)], centre=centre, radius=1)
+    lower, upper = hull.object_box(views)
+    assert (lower < centre - 0.95).all() and (upper > centre + 0.95).all() and (upper - lower).max() < 2.5
+    vertices, _, _ = hull.surface(hull.visual_hull(views, 80))
+    radius = np.linalg.norm(vertices - centre, axis=1)
+    assert radius.min() > 0.98 and np.median(radius) < 1.02 and radius.max() < peak
+
+
+def test_only_a_border_that_the_mask_touches_is_undecided():
+    camera, alpha = around()[20], np.zeros((SIZE, SIZE), np.float32)
+    alpha[30:60, :40] = 1  # leaves the frame on the left
+    silhouette = hull._Silhouette.of(alpha, camera)
+
+    def sample(*pixel):
+        """In pixels."""
+        ray = camera.rotation.T @ [*((np.array(pixel) - camera.principal) / camera.focal), 1]
+        return silhouette.sample((camera.origin + 2 * ray)[None].astype(np.float32))[0] * camera.focal[0] / 2
+
+    assert sample(20, 45) > 0 and np.isnan(sample(-5, 45)) and np.isnan(sample(-5, -5))
+    assert -61 < sample(20, -30) < -30 and -161 < sample(200, 45) < -104  # at least as far as the frame
+    behind = (camera.origin - 0.5 * camera.to_world[:3, 2])[None].astype(np.float32)
+    assert np.isnan(silhouette.sample(behind))
+    alpha[:, 0] = 0
+    assert hull._Silhouette.of(alpha, camera).sample(behind) == pytest.approx(-0.5)
+
+
 def test_views_that_lose_the_object_do_not_carve_it(data):
     """Close-ups that show a part of the sphere leave the rest of it alone."""
     close = views_of([Camera.look_at(c.origin, CENTRE + [0.3, 0.3, 0], (0, 0, 1), 12, (SIZE, SIZE))
@@ -157,7 +191,7 @@ def test_no_masks_and_no_common_volume(data):
     bare = [View(v.name, v.camera, v.pixels, False, None, v.path) for v in data.train]
     with pytest.raises(UserError, match="needs alpha masks in two views or more.*random points"):
         hull.visual_hull(bare)
-    apart = views_of(around()[:6]) + views_of(around()[6:12], centre=CENTRE + [0, 0, 0.7], radius=0.1)
+    apart = views_of(around()[:6]) + views_of(around()[6:12], centre=CENTRE + [0.7, 0, 0], radius=0.1)
     with pytest.raises(UserError, match="no common volume|hull is empty"):
         hull.visual_hull(apart)
 

@@ -46,6 +46,14 @@ def test_budget_and_other_fields(clock, capsys):
     assert capsys.readouterr().err == "fitting 100% · took 0:08\n"
 
 
+def test_time_left_of_a_resumed_fit(clock, capsys):
+    with Progress() as p:
+        for fraction in (0.5, 0.6):
+            clock[0] += 4
+            p.update(fraction)
+    assert capsys.readouterr().err == "fitting 60% · 0:16 left\n"
+
+
 def test_quiet_and_untouched(clock, capsys):
     with Progress(quiet=True) as p:
         clock[0] += 30

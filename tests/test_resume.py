@@ -27,7 +27,7 @@ def kill_and_resume(folder: Path, kills: int, seed=0) -> tuple[float, float, int
     around, rng, hits = time.monotonic() - begin - fitting, random.Random(seed), 0  # start, evaluation
     for _ in range(kills):
         process = start_script("optimize.py", *options, "--out", folder / "killed", "--resume")
-        time.sleep(rng.uniform(0.2, 0.7) * around + rng.uniform(0, 2) * fitting / (kills + 1))
+        time.sleep(rng.uniform(0.2, 0.5) * around + rng.uniform(0, 2) * fitting / (kills + 1))
         hits += process.poll() is None
         process.kill()
         process.communicate()
@@ -46,7 +46,7 @@ def finish(process):
 
 @pytest.mark.slow
 def test_killed_and_resumed(tmp_path):
-    whole, killed, hits = kill_and_resume(tmp_path, kills=5)
+    whole, killed, hits = kill_and_resume(tmp_path, kills=3)
     assert hits > 0
     assert abs(whole - killed) < TOLERANCE
 

@@ -139,6 +139,19 @@ def test_normals_of_test_views(tmp_path):
     np.testing.assert_allclose(normal[inside], np.broadcast_to(truth, (inside.sum(), 3)), atol=0.01)
 
 
+def test_normals_are_unknown_where_their_file_is_empty(tmp_path):
+    """Along silhouettes: a photograph's partial alpha over a black or transparent texel."""
+    encoded = np.full((16, 24, 4), [128, 128, 255, 255], np.uint8)
+    encoded[:, :12, :3] = 0
+    encoded[:8, :, 3] = 0
+    write(tmp_path, images={"a.png": disc(alpha=40), "a_normal.png": encoded, "b.png": disc()})
+    write(tmp_path, [frame("a")], split="test", images={})
+    known = (load_dataset(tmp_path).test[0].normal != 0).any(-1)
+    inside = disc()[..., 3] > 0
+    inside[:8], inside[:, :12] = False, False
+    np.testing.assert_array_equal(known, inside)
+
+
 def test_clamped_normals_are_used_only_where_nothing_was_lost(tmp_path):
     encoded = np.zeros((16, 24, 3), np.uint8)
     encoded[:, :12] = [0, 203, 231]  # (0, .6, .8) through the sRGB curve

@@ -16,6 +16,8 @@ from ..errors import UserError
 
 _EDGE_SIGMA = 0.6  # pixels; small enough that lines one pixel wide stay above one half
 _PIXEL_VARIANCE = 1 / 12  # of the box that an antialiased mask has been averaged over
+_FULL = 0.9  # a mask with more than this in a border pixel goes on beyond the frame
+_PAD = 2  # pixels of nothing around a mask that ends in its frame, as wide as the blur reaches
 
 
 @dataclass(frozen=True)
@@ -37,26 +39,50 @@ class SignedField:
 
 @dataclass(frozen=True)
 class _Silhouette:
-    """One view's mask as a signed distance in pixels ([H, W] float32, positive inside), and its camera."""
+    """One view's mask as a signed distance in pixels ([H, W] float32, positive inside), and its camera.
+
+    ``limits``: (left, top, right, bottom) in pixels; beyond them the view does not decide, since there the mask touches
+    the frame's border. A side that it does not touch is infinite: the object ends before it.
+    """
 
     distance: np.ndarray
     camera: object
+    limits: tuple[float, float, float, float]
+
+    @classmethod
+    def of(cls, alpha: np.ndarray, camera) -> "_Silhouette":
+        """From a mask [H, W] in [0, 1]."""
+        # An antialiased pixel that is not full has the object's end in it.
+        open_ = [edge.max() > _FULL for edge in (alpha[:, 0], alpha[0], alpha[:, -1], alpha[-1])]
+        left, top, right, bottom = (0 if o else _PAD for o in open_)
+        alpha = np.pad(alpha, ((top, bottom), (left, right)))
+        height, width = alpha.shape
+        limits = [limit if o else sign * np.inf
+                  for o, limit, sign in zip(open_, (0, 0, width - 1, height - 1), (-1, -1, 1, 1))]
+        return cls(_signed_distance(alpha), camera.cropped(-left, -top, width, height), tuple(limits))
 
     def sample(self, points: np.ndarray) -> np.ndarray:
-        """World-space signed distance [N] from the silhouette's cone at ``points`` [N, 3]; NaN outside the frame."""
+        """World-space signed distance [N] from the silhouette's cone at ``points`` [N, 3]; NaN where undecided."""
         camera, (height, width) = self.camera, self.distance.shape
         p = points @ camera.rotation.T.astype(np.float32) - (camera.rotation @ camera.origin).astype(np.float32)
         z = np.maximum(p[:, 2], np.float32(1e-6))
-        x = p[:, 0] / z * np.float32(camera.focal[0]) + np.float32(camera.principal[0] - 0.5)
-        y = p[:, 1] / z * np.float32(camera.focal[1]) + np.float32(camera.principal[1] - 0.5)
-        seen = (p[:, 2] > 1e-6) & (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-        x, y = np.where(seen, x, 0), np.where(seen, y, 0)
+        u = p[:, 0] / z * np.float32(camera.focal[0]) + np.float32(camera.principal[0] - 0.5)
+        v = p[:, 1] / z * np.float32(camera.focal[1]) + np.float32(camera.principal[1] - 0.5)
+        x, y = np.clip(u, 0, width - 1), np.clip(v, 0, height - 1)
+        beside = np.flatnonzero((x != u) | (y != v))
+        gap = np.hypot((u - x)[beside], (v - y)[beside])
         i, j = np.minimum(x.astype(np.int32), width - 2), np.minimum(y.astype(np.int32), height - 2)
         x, y, k, d = x - i, y - j, j * width + i, self.distance.ravel()
         upper = d.take(k) * (1 - x) + d.take(k + 1) * x
         lower = d.take(k + width) * (1 - x) + d.take(k + (width + 1)) * x
-        value = (upper * (1 - y) + lower * y) * z * np.float32(1 / np.mean(camera.focal))
-        return np.where(seen, value, np.float32(np.nan))
+        value = upper * (1 - y) + lower * y
+        value[beside] = -np.hypot(value[beside], gap)
+        value *= z * np.float32(1 / np.mean(camera.focal))
+        left, top, right, bottom = self.limits
+        behind = p[:, 2] <= 1e-6
+        value[behind] = -np.linalg.norm(p[behind], axis=1) if np.isinf(self.limits).all() else np.nan
+        value[(u < left) | (v < top) | (u > right) | (v > bottom)] = np.nan
+        return value
 
 
 def _signed_distance(alpha: np.ndarray) -> np.ndarray:
@@ -82,7 +108,7 @@ def _silhouettes(views) -> list[_Silhouette]:
         scale = np.float32(255) if view.pixels.dtype == np.uint8 else np.float32(1)
         alpha = view.pixels[..., 3] / scale
         blank = (alpha > 0.5).all() or not (alpha > 0.5).any() or min(alpha.shape) < 2
-        return None if blank else _Silhouette(_signed_distance(alpha), view.camera)
+        return None if blank else _Silhouette.of(alpha, view.camera)
 
     with ThreadPoolExecutor() as pool:
         found = [s for s in pool.map(one, [v for v in views if v.masked]) if s is not None]
@@ -96,7 +122,7 @@ def _carve(silhouettes, points: np.ndarray, truncation: float) -> np.ndarray:
     """The field [N] at ``points`` [N, 3], clipped to ± ``truncation``.
 
     Points drop out as soon as a view puts them further outside than the truncation. Points that fewer than a
-    quarter of the views see are outside, too.
+    quarter of the views decide are outside, too.
     """
     def chunk(points):
         value = np.full(len(points), truncation, np.float32)
@@ -169,8 +195,9 @@ def _object_box(silhouettes):
 def carve(views, box, resolution: int = 160) -> SignedField:
     """The visual hull of all masked views on a grid with ``resolution`` steps along the longest side of ``box``.
 
-    ``box`` is (lower [3], upper [3]) as from `object_box`. Where a point is outside a view's frame that view does not
-    decide. Raises: UserError without masks, or when nothing is left.
+    ``box`` is (lower [3], upper [3]) as from `object_box`. A view whose mask ends inside its frame carves all that is
+    beside it; beyond a border that the mask touches the view does not decide. Raises: UserError without masks, or when
+    nothing is left.
     """
     return _field(_silhouettes(views), box, resolution)
 

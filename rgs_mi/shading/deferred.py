@@ -33,20 +33,27 @@ def pixel_directions(camera, index):
 
 
 def shade(gbuffer, camera, filtered, eta=split_sum.DEFAULT_ETA) -> Image:
-    """Shade a G-buffer under a `FilteredEnvironment`. Only covered pixels are computed."""
-    pixels = camera.size[0] * camera.size[1]
+    """Shade a G-buffer under a `FilteredEnvironment`; None: diffuse radiance only."""
     diffuse = gbuffer.all.diffuse
+    if filtered is None:
+        return Image(diffuse, diffuse, dr.zeros(mi.Color3f, camera.size[0] * camera.size[1]), gbuffer)
+    specular = _specular(gbuffer, camera, filtered, eta)
+    return Image(diffuse + specular, diffuse, specular, gbuffer)
+
+
+def _specular(gbuffer, camera, filtered, eta):
+    """C_s times coverage, a lane a pixel. Only covered pixels are computed."""
+    specular = dr.zeros(mi.Color3f, camera.size[0] * camera.size[1])
     index = dr.compress(dr.detach(gbuffer.all.alpha) > COVERED)
-    specular = dr.zeros(mi.Color3f, pixels)
     if dr.width(index) > 0:
         m = gbuffer.maps(index)
         mean = dr.rcp(m.alpha)
         normal, view = dr.normalize(m.normal), -pixel_directions(camera, index)
         C_s = split_sum.specular(normal, view, m.roughness * mean, m.metallic * mean, m.base_color * mean, filtered, eta)
         dr.scatter(specular, C_s * m.alpha, index)
-    return Image(diffuse + specular, diffuse, specular, gbuffer)
+    return specular
 
 
 def render(surfels, camera, filtered, screen_offset=None, eta=split_sum.DEFAULT_ETA) -> Image:
-    """Splat and shade; differentiable in the surfels' fields and the environment."""
+    """Splat and `shade`; differentiable in the surfels' fields and the environment."""
     return shade(render_gbuffer(surfels, camera, screen_offset), camera, filtered, eta)

@@ -2,7 +2,8 @@
 
 A frame's ``transform_matrix`` is camera to world in the OpenGL convention (x right, y up, looking along -z). Intrinsics
 come from ``camera_angle_x`` (horizontal field of view, radians) or ``fl_x``, ``fl_y``, ``cx``, ``cy`` in pixels of a
-``w`` x ``h`` image; each may stand in the file or in a frame. ``transforms_val.json`` is not read.
+``w`` x ``h`` image; each may stand in the file or in a frame. ``transforms_val.json`` is not read. A sparse point cloud
+(`points.FILES`) may stand beside them, in the same world frame.
 """
 
 import json
@@ -17,6 +18,7 @@ from ..camera import Camera
 from ..color import srgb_decode
 from ..errors import UserError
 from . import Dataset, View
+from .points import sparse_points
 
 TRAIN, TEST = "transforms_train.json", "transforms_test.json"
 EXTENSIONS = (".png", ".exr", ".jpg", ".jpeg")  # in order of preference where file_path names none
@@ -33,8 +35,9 @@ def load(root: Path) -> Dataset:
     root = Path(root)
     if not root.is_dir():
         raise UserError(f"data folder '{root}' does not exist: give a capture's folder with --data")
+    points, colors = sparse_points(root) or (None, None)
     test = _load_split(root / TEST, normals=True) if (root / TEST).is_file() else []
-    return Dataset(train=_load_split(root / TRAIN, normals=False), test=test, root=root)
+    return Dataset(train=_load_split(root / TRAIN, normals=False), test=test, points=points, point_colors=colors, root=root)
 
 
 # ---- The JSON file ----
@@ -242,7 +245,8 @@ def _check_size(width: int, height: int):
 def _read_normal(stem: Path, pixels: np.ndarray, where: str) -> np.ndarray | None:
     """[H, W, 3] world-space unit normals that belong to the photograph ``stem``; 0 where unknown. None without a file.
 
-    ``_normal.png`` (Shiny Blender) holds n/2 + 1/2. ``_normal_0001.png`` (NeRF Synthetic) holds n itself, cut to [0, 1]
+    ``_normal.png`` (Shiny Blender) holds n/2 + 1/2 and is known where neither its own alpha is zero nor it is black,
+    which no unit normal is. ``_normal_0001.png`` (NeRF Synthetic) holds n itself, cut to [0, 1]
     and put through the sRGB curve (measured on lego: planes of its visual hull agree to 1 degree): it is known only
     where no negative component was lost, that is where its length is still one.
     """
@@ -254,8 +258,9 @@ def _read_normal(stem: Path, pixels: np.ndarray, where: str) -> np.ndarray | Non
     if image.shape != pixels.shape:
         raise UserError(f"{where}: {path} is {image.shape[1]} x {image.shape[0]}, its photograph "
                         f"{pixels.shape[1]} x {pixels.shape[0]}: normals need the same size")
+    black = ~image[..., :3].any(-1, keepdims=True)
     normal = image[..., :3].astype(np.float32) / np.float32(255)
     normal = 2 * normal - 1 if path == shiny else srgb_decode(normal)
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    known = (length > 0.1) if path == shiny else (np.abs(length - 1) < 0.02)
+    known = (length > 0.1) & ~black & (image[..., 3:] > 0) if path == shiny else (np.abs(length - 1) < 0.02)
     return np.where(known & (pixels[..., 3:] > 0), normal / np.maximum(length, 0.1), 0).astype(np.float32)
