@@ -18,7 +18,7 @@ from .scene import FitScene
 from .splat.composite import Layout, composite
 from .splat.lists import tile_lists
 from .splat.project import project
-from .surfel import Surfels
+from .surfel import Surfels, rotation_from_normal
 
 STAGES = ("lists", "forward", "backward")
 FEATURES = 9
@@ -48,11 +48,9 @@ def sphere(count: int, seed=0) -> Surfels:
     normals = unit(centers + 0.05 * rng.normal(size=(count, 3)))
     scales = 0.6 * np.sqrt(4 * np.pi / count) * np.exp(0.3 * rng.normal(size=(count, 2)))
     opacities = 1 / (1 + np.exp(-1.5 * rng.normal(size=(count, 1)) - 1))
-    # the half-way rotation that takes z to the normal
-    half = np.stack([-normals[:, 1], normals[:, 0], np.zeros(count), 1 + normals[:, 2]], 1)
     grey, zero = np.full((count, 3), 0.5), np.zeros((count, 3))
-    return Surfels.from_numpy({"centers": centers, "rotations": unit(half), "scales": scales, "opacities": opacities,
-                               "sh": zero, "base_color": grey, "roughness": grey[:, :1], "metallic": zero[:, :1],
+    return Surfels.from_numpy({"centers": centers, "rotations": rotation_from_normal(normals), "scales": scales,
+                               "opacities": opacities, "sh": zero, "base_color": grey, "roughness": grey[:, :1], "metallic": zero[:, :1],
                                "delta_normal": zero})
 
 
@@ -115,7 +113,7 @@ def splat(count=50_000, size=800, against=None, rounds=3):
 
 # ---- Step ----
 
-def step(path, data, count=12_000, steps=20, overrides=()):
+def step(path, data, count=15_000, steps=20, overrides=()):
     """Print the time of a fit's step on one view at full resolution with ``count`` surfels, and the kernels that were
     compiled after warm-up (which a fit of constant size should not need)."""
     scene = FitScene.load(path, data)

@@ -20,6 +20,7 @@ from .surfel import CHANNELS, Surfels
 _RATES = {"centers": "centers", "rotations": "rotations", "log_scales": "scales", "logit_opacities": "opacities",
           "sh_dc": "sh_dc", "sh_rest": "sh_rest", "logit_base_color": "base_color", "logit_roughness": "roughness",
           "logit_metallic": "metallic", "delta_normal": "delta_normal", ENVIRONMENT: "environment"}
+_DIVERGED = 10  # steps in a row without a finite error
 _CROP_MARGIN = 8  # pixels of background around the object that training looks at
 
 
@@ -85,7 +86,7 @@ class Fit:
         self.step_number, self.views_used, self.elapsed = 0, 0, 0.0
         self.gradients = Gradients(len(model))
         self.photographs = None
-        self.psnr = float("nan")
+        self.psnr, self.failures = 0.0, 0
 
     def state(self) -> tuple[dict, dict]:
         """(arrays, meta) for a checkpoint: with `resume` the fit goes on as if it had not been interrupted."""
@@ -149,10 +150,19 @@ class Fit:
             dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
         self.model.optimizer.step()
-        self.psnr = -10 * np.log10(max(np.mean([float(e[0]) for e in errors]), 1e-10))
+        self._judge(np.mean([float(e[0]) for e in errors]))
         self.step_number += 1
         self._control_density()
         self.elapsed += time.monotonic() - start
+
+    def _judge(self, error):
+        """Note the step's mean squared error. One that is not a number is an overflow in some pixel; when it stays, the fit
+        has diverged, and its PSNR says so."""
+        self.failures = 0 if np.isfinite(error) else self.failures + 1
+        if self.failures == 0:
+            self.psnr = -10 * np.log10(max(error, 1e-10))
+        elif self.failures >= _DIVERGED:
+            self.psnr = float("nan")
 
     def _view(self, i, surfels, filtered, weight):
         """Accumulate the gradients of one view's loss; returns its mean squared error."""

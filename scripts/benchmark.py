@@ -23,7 +23,7 @@ def main():
     step = commands.add_parser("step", help="a warm step at full resolution")
     step.add_argument("--scene", type=Path, default=_OBJECT, help="(default: object.xml)")
     step.add_argument("--data", type=Path, required=True, metavar="DIR", help="a capture's folder")
-    step.add_argument("--surfels", type=int, default=12_000, help="(default: %(default)s)")
+    step.add_argument("--surfels", type=int, default=15_000, help="(default: %(default)s)")
     step.add_argument("--steps", type=int, default=20, help="(default: %(default)s)")
     step.add_argument("--set", dest="overrides", action="append", default=[], metavar="A.B=VALUE", help="one setting")
     args = parser.parse_args()
