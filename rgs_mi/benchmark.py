@@ -50,8 +50,8 @@ def sphere(count: int, seed=0) -> Surfels:
     opacities = 1 / (1 + np.exp(-1.5 * rng.normal(size=(count, 1)) - 1))
     grey, zero = np.full((count, 3), 0.5), np.zeros((count, 3))
     return Surfels.from_numpy({"centers": centers, "rotations": rotation_from_normal(normals), "scales": scales,
-                               "opacities": opacities, "sh": zero, "base_color": grey, "roughness": grey[:, :1], "metallic": zero[:, :1],
-                               "delta_normal": zero})
+                               "opacities": opacities, "sh": zero, "base_color": grey, "roughness": grey[:, :1],
+                               "metallic": zero[:, :1], "delta_normal": zero})
 
 
 def splat_times(surfels: Surfels, size: int) -> dict[str, float]:

@@ -8,6 +8,13 @@ class UserError(Exception):
     """Bad input. The message is one line: what is wrong, in which file, and what to do about it."""
 
 
+def parse_variables(pairs: list[str]) -> dict[str, str]:
+    """["name=value", …], as -D gives them, as a dictionary. Raises: UserError for a pair without '='."""
+    if bad := [p for p in pairs if "=" not in p]:
+        raise UserError(f"-D {bad[0]}: write name=value")
+    return dict(p.split("=", 1) for p in pairs)
+
+
 def run_main(main):
     """Call ``main()`` as a command: a ``UserError`` prints one line and exits with 2, Ctrl-C with 130; warnings print one
     line each."""

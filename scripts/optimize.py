@@ -5,13 +5,7 @@ import argparse
 from pathlib import Path
 
 import rgs_mi
-from rgs_mi.errors import UserError, run_main
-
-
-def _variables(pairs: list[str]) -> dict:
-    if bad := [p for p in pairs if "=" not in p]:
-        raise UserError(f"-D {bad[0]}: write name=value")
-    return dict(p.split("=", 1) for p in pairs)
+from rgs_mi.errors import parse_variables, run_main
 
 
 def main():
@@ -35,7 +29,7 @@ def main():
     rgs_mi.set_variant(args.variant)
     from rgs_mi.run import optimize
 
-    optimize(args.scene, data=args.data, variables=_variables(args.define), config=args.config,
+    optimize(args.scene, data=args.data, variables=parse_variables(args.define), config=args.config,
              overrides=args.overrides, minutes=args.minutes, seed=args.seed, out=args.out, resume=args.resume,
              quiet=args.quiet)
 

@@ -5,13 +5,7 @@ import argparse
 from pathlib import Path
 
 import rgs_mi
-from rgs_mi.errors import UserError, run_main
-
-
-def _variables(pairs: list[str]) -> dict:
-    if bad := [p for p in pairs if "=" not in p]:
-        raise UserError(f"-D {bad[0]}: write name=value")
-    return dict(p.split("=", 1) for p in pairs)
+from rgs_mi.errors import parse_variables, run_main
 
 
 def main():
@@ -35,7 +29,7 @@ def main():
     from rgs_mi.truth import render_dataset
 
     out = render_dataset(args.scene, args.out or Path("data") / args.scene.stem, train=args.train, test=args.test,
-                         size=args.size, spp=args.spp, radius=args.radius, variables=_variables(args.define),
+                         size=args.size, spp=args.spp, radius=args.radius, variables=parse_variables(args.define),
                          seed=args.seed, quiet=args.quiet)
     print(out)
 
