@@ -9,7 +9,6 @@ from .splat.project import opaque
 
 SATURATED = 0.995  # display value from which a photograph only says "at least this bright"
 CREASE = 0.1  # difference of unit normals from pixel to pixel that counts as an edge
-JUMP = 0.05  # 1 − cosine between rendered and depth normal that counts as a jump in depth
 _WINDOW, _SIGMA = 11, 1.5  # SSIM's Gaussian window
 _C1, _C2 = 0.01**2, 0.03**2
 
@@ -120,8 +119,7 @@ def depth_normal_consistency(gbuffer, camera):
 
     n_depth = dr.normalize(dr.cross(point(index + width) - point(index - width), point(index + 1) - point(index - 1)))
     n = dr.normalize(R @ gbuffer.maps(index).normal)
-    difference = 1 - dr.dot(n, n_depth)
-    return dr.sum(difference / (1 + difference / JUMP)) / (width * height)
+    return dr.sum(1 - dr.dot(n, n_depth)) / (width * height)
 
 
 def normal_smoothness(gbuffer):

@@ -47,7 +47,7 @@ class Weights:
 
     dssim: float = _within(0.2, 0, 1)  # of D-SSIM against L1
     mask: float = _within(0.1, 0, 1e3)
-    consistency: float = _within(0.1, 0, 1e3)  # depth-normal consistency (2DGS)
+    consistency: float = _within(0.4, 0, 1e3)  # depth-normal consistency (2DGS)
     smoothness: float = _within(0.1, 0, 1e3)  # of rendered normals
 
 
