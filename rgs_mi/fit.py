@@ -176,8 +176,8 @@ class Fit:
         loss = losses.photometric(rendered, target, camera.size, w.dssim)
         if w.mask > 0 and self.dataset.train[i].masked:
             loss += w.mask * losses.mask(maps.alpha, alpha)
-        if w.consistency > 0:
-            loss += w.consistency * losses.depth_normal_consistency(image.gbuffer, camera)
+        consistency = dr.opaque(mi.Float, self._scheduled(w.consistency))
+        loss += consistency * losses.depth_normal_consistency(image.gbuffer, camera)
         if w.smoothness > 0:
             loss += w.smoothness * losses.normal_smoothness(image.gbuffer)
         share = camera.size[0] * camera.size[1] / (whole[0] * whole[1])  # losses are means over the whole photograph
@@ -196,11 +196,15 @@ class Fit:
         self.views_used += count
         return chosen
 
+    def _scheduled(self, pair):
+        """The value of a (first, last) pair at this point of the fit."""
+        first, last = pair
+        return first * (last / first) ** self.progress
+
     def _set_rates(self):
         rate = {}
         for name, field in _RATES.items():
-            first, last = getattr(self.settings.rates, field)
-            rate[name] = first * (last / first) ** self.progress
+            rate[name] = self._scheduled(getattr(self.settings.rates, field))
         rate["centers"] *= self.extent
         self.model.optimizer.set_learning_rate(rate)
 

@@ -47,7 +47,8 @@ class Weights:
 
     dssim: float = _within(0.2, 0, 1)  # of D-SSIM against L1
     mask: float = _within(0.1, 0, 1e3)
-    consistency: float = _within(0.4, 0, 1e3)  # depth-normal consistency (2DGS)
+    # depth-normal consistency (2DGS), first and last, joined geometrically: early on it would hold the surface back
+    consistency: tuple[float, float] = _within((0.05, 0.6), 1e-6, 1e3)
     smoothness: float = _within(0.1, 0, 1e3)  # of rendered normals
 
 

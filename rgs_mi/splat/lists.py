@@ -13,6 +13,7 @@ import mitsuba as mi
 from .tiles import LOW_PASS, TILE, tile_grid
 
 FAR = 1e6  # pixels: beyond every image
+SORT_RADIUS = 3.0  # standard deviations
 
 
 @dataclass
@@ -81,6 +82,22 @@ def _outline(geometry, alpha_min):
                     dr.sqrt(r2 / LOW_PASS)), r2 > 0
 
 
+def _depth_at_tile(geometry, column, row):
+    """Depth of surfels where the ray through a tile's centre meets them, or, at most SORT_RADIUS standard deviations from
+    their own centres, comes closest to it.
+
+    Sorting by the centres' depths instead would favour, on a smooth surface, the surfels that lie nearer to the camera than
+    the pixel does: their normals face it more, and reflections move by about a standard deviation.
+    """
+    x, y, A_x, A_y, B_x, B_y, N_x, N_y, z, _ = geometry
+    dx = (mi.Float(column) + 0.5) * TILE[0] - x
+    dy = (mi.Float(row) + 0.5) * TILE[1] - y
+    # (u, v) of equation (1) without its 1/h, which is near 1 where it matters
+    distance = dr.sqrt(dr.square(A_x * dx + A_y * dy) + dr.square(B_x * dx + B_y * dy))
+    shrink = dr.minimum(1, SORT_RADIUS / dr.maximum(distance, 1e-6))
+    return z / dr.clip(1 + shrink * (N_x * dx + N_y * dy), 0.5, 2)
+
+
 def tile_lists(projected, size, alpha_min) -> TileLists:
     """List the surfels of every tile of an image of ``size`` (width, height) pixels."""
     with dr.suspend_grad():
@@ -94,10 +111,7 @@ def tile_lists(projected, size, alpha_min) -> TileLists:
         drawn &= top < bottom
         bottom = dr.select(drawn, bottom, top)
 
-        order = dr.argsort(dr.select(drawn, projected.geometry[8], dr.inf))
-        outline = _Outline(*[dr.gather(mi.Float, v, order) for v in outline.columns()])
-        top, bottom = dr.gather(mi.Int32, top, order), dr.gather(mi.Int32, bottom, order)
-        dr.eval(order, outline.columns(), top, bottom)
+        dr.eval(outline.columns(), top, bottom)
 
         def span(row):
             """First and one-past-last tile column of a tile row."""
@@ -115,27 +129,30 @@ def tile_lists(projected, size, alpha_min) -> TileLists:
         offset = dr.prefix_reduce(dr.ReduceOp.Add, entries, exclusive=True)
         total = int(offset[-1] + entries[-1]) if len(entries) else 0
         n_tiles = columns * rows
-        seen = dr.zeros(mi.Bool, dr.width(order))
+        seen = entries > 0
         if total == 0:
             return TileLists(dr.zeros(mi.UInt32, 1), dr.zeros(mi.UInt32, n_tiles), dr.zeros(mi.UInt32, n_tiles), seen)
-        tile, surfel = dr.empty(mi.UInt32, total), dr.empty(mi.UInt32, total)
+        tile, surfel, depth = dr.empty(mi.UInt32, total), dr.empty(mi.UInt32, total), dr.empty(mi.Float, total)
+        number = dr.arange(mi.UInt32, dr.width(entries))
 
         def place(row, at):
             first, last = span(row)
 
             def put(column, at):
                 dr.scatter(tile, mi.UInt32(row) * columns + column, at)
-                dr.scatter(surfel, order, at)
+                dr.scatter(surfel, number, at)
+                dr.scatter(depth, _depth_at_tile(projected.geometry, column, row), at)
                 return column + 1, at + 1
 
             _, at = dr.while_loop((first, at), lambda column, at: column < last, put)
             return row + 1, at
 
         dr.eval(dr.while_loop((mi.Int32(top), mi.UInt32(offset)), lambda row, at: row < bottom, place))
-        dr.scatter(seen, entries > 0, order)
         length = dr.zeros(mi.UInt32, n_tiles)
         dr.scatter_reduce(dr.ReduceOp.Add, length, mi.UInt32(1), tile)
         first = dr.prefix_reduce(dr.ReduceOp.Add, length, exclusive=True)
-        ids = dr.gather(mi.UInt32, surfel, dr.argsort(tile))  # stable: depth order survives inside a tile
+        near = dr.argsort(depth)
+        order = dr.gather(mi.UInt32, near, dr.argsort(dr.gather(mi.UInt32, tile, near)))  # stable: by tile, then by depth
+        ids = dr.gather(mi.UInt32, surfel, order)
         dr.eval(ids, first, length, seen)
         return TileLists(ids, first, length, seen)

@@ -9,8 +9,36 @@ import mitsuba as mi
 import numpy as np
 
 from .gbuffer import Maps
+from .lists import SORT_RADIUS
 from .project import NEAR
-from .tiles import LOW_PASS, Cutoffs
+from .tiles import LOW_PASS, TILE, Cutoffs
+
+
+def _front_to_back(surfels, camera) -> np.ndarray:
+    """[pixels, N] numbers of the surfels in front of the camera, by their depth on the ray through the centre of the pixel's
+    tile, which counts no farther than SORT_RADIUS standard deviations from their own centres."""
+    fields = surfels.numpy()
+    width, height = camera.size
+    centre = (fields["centers"].astype(np.float64) - camera.origin) @ camera.rotation.T
+    t_u, t_v, normal = (v.numpy().T.astype(np.float64) @ camera.rotation.T for v in surfels.frames())
+    front = np.flatnonzero(centre[:, 2] > NEAR)
+    keys = np.empty((height, width, len(front)))
+    for row in range(0, height, TILE[1]):
+        for column in range(0, width, TILE[0]):
+            middle = np.array([column + TILE[0] / 2, row + TILE[1] / 2])
+            for k, i in enumerate(front):
+                c, z = centre[i], centre[i, 2]
+                offset = middle - (c[:2] / z * camera.focal + camera.principal)
+                ray = lambda s: np.append((c[:2] / z + s * offset / camera.focal), 1.0)
+                facing = c @ normal[i] / z  # of the ray through the surfel's centre
+                # where a small step along the offset leads on the surfel, continued linearly
+                step = 1e-6
+                hit = (c @ normal[i]) / (ray(step) @ normal[i]) * ray(step) - c
+                distance = np.hypot(hit @ t_u[i] / fields["scales"][i, 0], hit @ t_v[i] / fields["scales"][i, 1]) / step
+                shrink = min(1.0, SORT_RADIUS / max(distance, 1e-6))
+                slope = (ray(1.0) @ normal[i]) / facing - 1
+                keys[row:row + TILE[1], column:column + TILE[0], k] = z / np.clip(1 + shrink * slope, 0.5, 2)
+    return front[np.argsort(keys.reshape(width * height, -1), axis=1, kind="stable")].astype(np.uint32)
 
 
 def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> Maps:
@@ -21,12 +49,10 @@ def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> Maps:
 
     centers = surfels.column(mi.Point3f, "centers")
     depth = dr.dot(centers - origin, z_axis)
-    order = np.argsort(depth.numpy(), kind="stable")
-    order = order[depth.numpy()[order] > NEAR].astype(np.uint32)
-    n = len(order)
-    pair = dr.arange(mi.UInt32, width * height * n)  # pixel-major, front to back
-    pixel, rank = pair // n, pair % n
-    surfel = dr.gather(mi.UInt32, mi.UInt32(order), rank)
+    order = _front_to_back(surfels, camera)
+    n = order.shape[1]
+    surfel = mi.UInt32(order.ravel())  # pixel-major, front to back
+    pixel = dr.arange(mi.UInt32, width * height * n) // n
     of = lambda kind, name: dr.gather(kind, getattr(surfels, name).array, surfel)
 
     d = mi.Vector3f(np.ascontiguousarray(camera.rays().reshape(-1, 3).T.astype(np.float32)))  # camera-space z is 1
