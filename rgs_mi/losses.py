@@ -11,6 +11,7 @@ SATURATED = 0.995  # display value from which a photograph only says "at least t
 CREASE = 0.1  # difference of unit normals from pixel to pixel that counts as an edge
 _WINDOW, _SIGMA = 11, 1.5  # SSIM's Gaussian window
 _C1, _C2 = 0.01**2, 0.03**2
+_FLAT = 1e-6  # standard deviation of a depth map, in units of its depth, up to which it is constant
 
 
 def srgb(x):
@@ -134,3 +135,36 @@ def normal_smoothness(gbuffer):
     limited = lambda d2: d2 / (1 + d2 / CREASE**2)
     difference = sum(limited(dr.squared_norm(normal(index + step) - here)) for step in (1, width))
     return dr.sum(difference) * dr.opaque(mi.Float, 1 / dr.width(index))  # a literal would recompile at every count
+
+
+def pearson_depth(depth, prior, valid, inverse=False):
+    """RGS's L_depth: 1 − r, with r Pearson's correlation of the rendered z-depth and a prior's over the ``valid`` pixels.
+
+    ``depth``, ``prior``: ``mi.Float``, a lane a pixel; ``valid``: ``mi.Bool``, where both are known (pixels where one is not
+    finite never count). ``inverse``: the prior holds inverse depths, which are compared with 1/z (z > 0 where valid).
+    Differentiable in ``depth``. r knows neither scale nor shift of the prior; where one of the two maps is constant, or
+    fewer than two pixels are valid, it isn't defined, and the loss and its gradient are 0.
+    """
+    with dr.suspend_grad():
+        valid = valid & dr.isfinite(prior) & dr.isfinite(depth)
+        if inverse:
+            valid &= depth > 0
+        count = mi.Float(dr.maximum(dr.count(valid), 1))
+    x = dr.rcp(dr.select(valid, depth, 1)) if inverse else depth
+    x, spread_x = _centred(x, valid, count)
+    y, spread_y = _centred(prior, valid, count)
+    defined = (spread_x > 0) & (spread_y > 0)
+    r = dr.sum(x * y) / dr.select(defined, spread_x * spread_y, 1)
+    return dr.select(defined, 1 - r, 0)
+
+
+def _centred(x, valid, count):
+    """The ``valid`` lanes of ``x`` less their mean (0 in the others), and the root of the sum of their squares; that is 0
+    where the map is constant but for rounding."""
+    with dr.suspend_grad():
+        base = dr.min(dr.select(valid, x, dr.inf))  # first, so that a sum of many alike numbers loses nothing
+    x = dr.select(valid, x - base, 0)
+    x = dr.select(valid, x - dr.sum(x) / count, 0)
+    square = dr.sum(x * x)
+    varies = square > count * dr.square(_FLAT * base)
+    return x, dr.select(varies, dr.sqrt(dr.select(varies, square, 1)), 0)

@@ -26,3 +26,17 @@ def sphere_surfels(n, seed=0, scale=0.6, opacity_shift=1.0, order=1):
 def orbit_camera(angle=0.3, size=(48, 40), distance=4.0, fov=38.0):
     """A camera on a circle about the z axis that looks at the origin."""
     return Camera.look_at([distance * np.cos(angle), distance * np.sin(angle), 0.8], [0, 0, 0], [0, 0, 1], fov, size)
+
+
+def layered_surfels(camera, seed):
+    """Surfels one behind the other, turned to the camera, wider than a pixel: no small step changes their order or hands
+    them to the low-pass, which are jumps and kinks that finite differences see and derivatives do not."""
+    surfels, rng, n = sphere_surfels(12, seed=seed), np.random.default_rng(seed), 12
+    right, down, forward = camera.rotation
+    across = rng.uniform(-0.7, 0.7, (n, 2))
+    centers = across[:, :1] * right + across[:, 1:] * down + np.linspace(-1.2, 1.2, n)[:, None] * forward
+    normals = 0.1 * rng.normal(size=(n, 3)) - forward
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Surfels.from_numpy(surfels.numpy() | {
+        "centers": centers, "rotations": rotation_from_normal(normals, rng.uniform(0, 6, n)),
+        "scales": rng.uniform(0.15, 0.3, (n, 2))})

@@ -7,6 +7,7 @@ import pytest
 from scipy import ndimage
 
 from rgs_mi import losses
+from rgs_mi.aligned import lanes as aligned
 from rgs_mi.color import srgb_encode
 from rgs_mi.splat.gbuffer import render_gbuffer
 
@@ -87,3 +88,77 @@ def test_nothing_covered_costs_nothing():
     from rgs_mi.surfel import Surfels
     gbuffer = render_gbuffer(Surfels.from_numpy(arrays), camera)
     assert losses.depth_normal_consistency(gbuffer, camera)[0] == 0 and losses.normal_smoothness(gbuffer)[0] == 0
+
+
+# ---- The depth prior ----
+
+def depths(seed, n=400):
+    """Rendered depths, a prior correlated with them, and where both are known."""
+    rng = np.random.default_rng(seed)
+    depth = 4 + 0.3 * rng.normal(size=n)
+    return depth, 17 - 5 * depth + rng.normal(size=n), rng.random(n) < 0.7
+
+
+def pearson(depth, prior, valid, **options):
+    """(value, gradient) of the loss."""
+    depth = aligned(depth)
+    dr.enable_grad(depth)
+    loss = losses.pearson_depth(depth, aligned(prior), aligned(valid) > 0, **options)
+    dr.backward(loss)
+    return loss[0], dr.grad(depth).numpy()
+
+
+@pytest.mark.parametrize("inverse", [False, True])
+def test_pearson_depth_equals_numpy_and_finite_differences(inverse):
+    depth, prior, valid = depths(0)
+
+    def twin(z):
+        return 1 - np.corrcoef(1 / z[valid] if inverse else z[valid], prior[valid])[0, 1]
+
+    noise = np.where(valid, 0, np.nan)  # what is unknown must not matter, whatever it is
+    value, gradient = pearson(depth + noise, prior + noise, valid, inverse=inverse)
+    assert value == pytest.approx(twin(depth), abs=1e-5)
+    direction = np.random.default_rng(1).normal(size=depth.shape)
+    difference = (twin(depth + 1e-5 * direction) - twin(depth - 1e-5 * direction)) / 2e-5
+    assert (gradient * direction).sum() == pytest.approx(difference, rel=1e-3)
+    assert np.all(gradient[~valid] == 0)
+
+
+@pytest.mark.parametrize("scale, shift", [(3.0, 0.0), (1e-3, 0.5), (40.0, 1000.0)])
+def test_pearson_depth_knows_neither_scale_nor_shift(scale, shift):
+    depth, prior, valid = depths(2, 50_000)
+    reference, _ = pearson(depth, prior, valid)
+    assert pearson(scale * depth + shift, prior, valid)[0] == pytest.approx(reference, abs=2e-4)
+    assert pearson(depth, scale * prior + shift, valid)[0] == pytest.approx(reference, abs=2e-4)
+    assert pearson(depth, scale * depth + shift, valid)[0] == pytest.approx(0, abs=1e-5)
+    assert pearson(depth, 1 / depth, valid, inverse=True)[0] == pytest.approx(0, abs=1e-5)
+
+
+@pytest.mark.parametrize("case", ["flat depth", "flat up to rounding", "flat prior", "none", "one", "no prior"])
+def test_pearson_depth_of_nothing_is_nothing(case):
+    depth, prior, valid = depths(3, 100_000)
+    if case == "flat depth":
+        depth[:] = 4.1
+    elif case == "flat up to rounding":
+        depth = 4.1 * (1 + 1e-7 * np.sign(depth - 4))
+    elif case == "flat prior":
+        prior[:] = 0.3
+    elif case == "no prior":
+        prior[:] = np.nan
+    else:
+        valid[:] = False
+        valid[:1 if case == "one" else 0] = True
+    for inverse in (False, True):
+        value, gradient = pearson(depth, prior, valid, inverse=inverse)
+        assert value == 0 and np.all(gradient == 0)
+
+
+def test_pearson_depth_compiles_once():
+    pearson(*depths(0))
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        depth, prior, valid = depths(4)
+        pearson(depth, prior, valid & (np.arange(400) > 100))
+        pearson(*depths(5, 333))
+        history = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    assert len(history) > 5 and all(k["cache_hit"] for k in history)

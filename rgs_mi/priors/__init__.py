@@ -1,0 +1,116 @@
+"""Depth priors: what is known of a photograph's depth before anything is fitted, one interface for all of them.
+
+    hull    the visual hull of the masks (`hull.py`): no network, and no reflection misleads it
+    files   maps of any estimator, one a photograph (`files.py`)
+    vggt    the foundation model (`vggt.py`), where its package and weights are
+    none
+"""
+
+import hashlib
+import inspect
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from ..checkpoint import atomic_file
+from ..errors import UserError
+from . import files, hull, vggt
+from .maps import DepthPrior
+
+__all__ = ["NAMES", "DepthPrior", "depth_priors"]
+
+_VERSION = 1  # of everything that decides what is in the maps: a cached prior of another version is not read
+
+
+def _hull(views, resolution: int = 160) -> list[DepthPrior]:
+    """z-depths of the visual hull, ``resolution`` steps along its longest side; NaN beside it. Needs a JIT variant."""
+    vertices, faces, _ = hull.surface(hull.visual_hull(views, resolution))
+    return [DepthPrior(depth) for depth in hull.depth_maps(vertices, faces, [view.camera for view in views])]
+
+
+_PRIORS = {"hull": _hull, "files": files.load, "vggt": vggt.estimate}
+NAMES = (*_PRIORS, "none")
+
+
+def depth_priors(name: str, views, *, cache=None, **options) -> list[DepthPrior] | None:
+    """The prior called ``name`` of each of ``views``, in their order; None for ``none``.
+
+    Args:
+      name: one of `NAMES`
+      views: list of `View`
+      cache: folder where results are kept, or None. A result is found again by the photographs' pixels, the options, the
+        hull's cameras and VGGT's weights, wherever the files lie. What `files` reads is not kept a second time
+      options: hull: resolution; files: folder, inverse, suffix (`files.load`); vggt: weights, batch, overlap, background
+        (`vggt.estimate`); none takes any
+
+    Raises: UserError for a name or an option that is not there, and as the prior itself does.
+    """
+    if name == "none":
+        return None
+    if name not in _PRIORS:
+        raise UserError(f"prior '{name}' is unknown: choose one of {', '.join(NAMES)}")
+    try:
+        call = inspect.signature(_PRIORS[name]).bind(views, **options)
+    except TypeError as error:
+        known = ", ".join(list(inspect.signature(_PRIORS[name]).parameters)[1:])
+        raise UserError(f"prior '{name}': {error}: its options are {known}") from error
+    call.apply_defaults()
+    options = dict(list(call.arguments.items())[1:])
+    if cache is None or name == "files":
+        return _PRIORS[name](views, **options)
+    path = Path(cache) / f"{name}-{_key(name, views, options)[:24]}.npz"
+    priors = _load(path, views)
+    if priors is None:
+        priors = _PRIORS[name](views, **options)
+        _save(path, priors)
+    return priors
+
+
+# ---- The cache ----
+
+def _key(name, views, options) -> str:
+    """A hash of all that the result depends on."""
+    if name == "vggt":
+        options = options | {"weights": vggt.fingerprint(options["weights"])}
+    digest = hashlib.sha256(json.dumps([_VERSION, name, options], sort_keys=True, default=str).encode())
+    for view in views:
+        digest.update(f"{view.pixels.dtype} {view.pixels.shape} {view.masked}".encode())
+        digest.update(np.ascontiguousarray(view.pixels))
+        if name == "hull":
+            camera = view.camera
+            digest.update(np.concatenate([camera.to_world.ravel(), camera.focal, camera.principal, camera.size]).tobytes())
+    return digest.hexdigest()
+
+
+def _load(path, views) -> list[DepthPrior] | None:
+    """The priors of ``views`` in a file; None where it is missing or, with a warning, damaged."""
+    if not path.is_file():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            priors = [DepthPrior(arrays[f"values_{i}"], bool(arrays["inverse"][i]), arrays.get(f"confidence_{i}"))
+                      for i in range(len(views))]
+        for prior, view in zip(priors, views):
+            for array in (prior.values, prior.confidence):
+                if array is not None and (array.shape != view.pixels.shape[:2] or array.dtype != np.float32):
+                    raise ValueError("a map has the wrong shape")
+        return priors
+    except Exception as error:  # a damaged zip fails in a dozen ways, and each means the same here
+        warnings.warn(f"{path} is damaged ({error}): estimating the prior again", stacklevel=3)
+        return None
+
+
+def _save(path, priors):
+    """Write ``priors`` whole or not at all. A disk that takes no more costs the cache, not the result."""
+    arrays = {"inverse": np.array([prior.inverse for prior in priors])}
+    for i, prior in enumerate(priors):
+        arrays[f"values_{i}"] = prior.values
+        if prior.confidence is not None:
+            arrays[f"confidence_{i}"] = prior.confidence
+    try:
+        with atomic_file(path) as stream:
+            np.savez_compressed(stream, **arrays)
+    except UserError as error:
+        warnings.warn(str(error), stacklevel=3)

@@ -5,6 +5,10 @@ Per pixel, over its tile's surfels front to back, with T_1 = 1:
     α_i = o_i exp(−½ min(u² + v², LOW_PASS |δ|²)),   w_i = T_i α_i,   T_{i+1} = T_i − w_i,
     image = Σ_i w_i (features_i, t_i, 1)                                                           (2)
 
+Lists are sorted by depth at the tile's centre, which on a smooth surface, where surfels lie almost on one another, is not
+their order elsewhere: reflections would jump from tile to tile, and with the view. So each lane sorts on the way, in a queue
+of ``window`` surfels, by the depth at which its own 2 × 2 pixels meet them (StopThePop, Radl et al. 2024).
+
 The adjoint walks the same list again, front to back, and stores nothing per step. With g_i the inner product of the
 pixel's adjoint with surfel i's vector in (2), and rest_i = Σ_{j>i} w_j g_j,
 
@@ -14,16 +18,18 @@ and the chain from α, t down to the ten numbers of a record is written out in `
 walks it a third way: Ṫ_{i+1} = Ṫ_i − ẇ_i.
 """
 
+import math
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
 from .project import GEOMETRY
-from .tiles import LOW_PASS, Cutoffs, lane_pixels
+from .tiles import LOW_PASS, PIXELS, Cutoffs, lane_pixels
 
 PACKET = 4  # floats per gather and scatter
 HORIZON = 1e-5  # least h of (1): beyond it a ray runs along the surfel's plane, or meets it behind the camera
+_HALF_DIAGONAL = 0.5 * math.hypot(PIXELS[0] - 1, PIXELS[1] - 1)  # from a lane's middle to its pixels' centres
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,11 @@ class Layout:
     @property
     def record(self):
         return -(-(len(GEOMETRY) + self.features) // PACKET) * PACKET
+
+    @property
+    def geometry(self):
+        """Floats to fetch for the geometric part of a record."""
+        return -(-len(GEOMETRY) // PACKET) * PACKET
 
     @property
     def pixel(self):
@@ -56,10 +67,10 @@ def pack(projected, features, layout):
     return out
 
 
-def _fetch(buffer, row, stride, active=True):
-    """``stride`` floats of row ``row``, as a list."""
+def _fetch(buffer, row, stride, active=True, count=None):
+    """The first ``count`` (None: all) of the ``stride`` floats of row ``row``, as a list; zeros where not ``active``."""
     floats = []
-    for q in range(stride // PACKET):
+    for q in range((count or stride) // PACKET):
         floats += list(dr.gather(mi.Vector4f, buffer, row * (stride // PACKET) + q, active))
     return floats
 
@@ -84,6 +95,19 @@ class _Hit:
         self.clamped = alpha > cutoffs.alpha_max
         self.alpha = dr.select(self.kept, dr.minimum(alpha, cutoffs.alpha_max), 0)
         self.t = dr.select(self.on_plane, z * self.inv_h, z)
+
+    def sort_key(self, record, cutoffs):
+        """t, if this hit is in the middle of a lane's pixels, and −∞ where none of them can see the surfel."""
+        _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, opacity = record[:len(GEOMETRY)]
+        tilt = _HALF_DIAGONAL * dr.sqrt(N_x * N_x + N_y * N_y)
+        turn = _HALF_DIAGONAL * dr.sqrt(A_x * A_x + A_y * A_y + B_x * B_x + B_y * B_y)
+        # From the middle to a pixel, h changes by at most tilt, and (u, v) by (turn + |(u, v)| tilt) / h there
+        distance = dr.sqrt(self.u * self.u + self.v * self.v)
+        least_h = dr.rcp(self.inv_h) - tilt
+        on_plane = dr.select(least_h > HORIZON, distance - (turn + distance * tilt) / least_h, 0)
+        on_screen = math.sqrt(LOW_PASS) * (dr.sqrt(self.dx * self.dx + self.dy * self.dy) - _HALF_DIAGONAL)
+        nearest = dr.maximum(dr.minimum(on_plane, on_screen), 0)
+        return dr.select(opacity * dr.exp(-0.5 * nearest * nearest) > cutoffs.alpha_min, self.t, -dr.inf)
 
     def pull_back(self, record, d_alpha, d_t):
         """Gradient of the ten geometric numbers, from that of α and t."""
@@ -111,26 +135,38 @@ class _Hit:
         return alpha_, dr.select(self.on_plane, (z_ - self.t * h_) * self.inv_h, z_)
 
 
-def _walk(lists, layout, state, body):
-    """Run ``body(surfel, pixels, T, state) -> (T, state)`` over every tile's list; T and state are lists, one a pixel of a
-    lane. Returns the final state."""
+def _walk(records, lists, layout, state, body):
+    """Run ``body(surfel, valid, pixels, T, state) -> (T, state)`` over every tile's list, each lane in its own order; T and
+    state are lists, one a pixel of a lane. Returns the final state."""
     tile, pixels = lane_pixels(layout.size)
+    window = layout.cutoffs.window
     first = dr.gather(mi.UInt32, lists.first, tile)
-    end = first + dr.gather(mi.UInt32, lists.count, tile)
+    count = dr.gather(mi.UInt32, lists.count, tile)
+    end, stop = first + count, first + dr.select(count > 0, count + window, 0)
     centres = [(mi.Float(x) + 0.5, mi.Float(y) + 0.5) for x, y in pixels]
+    middle = [mi.Float(corner) + 0.5 * n for corner, n in zip(pixels[0], PIXELS)]
 
-    def alive(i, T, state):
+    def alive(i, depths, surfels, T, state):
         greatest = T[0]
         for t in T[1:]:
             greatest = dr.maximum(greatest, t)
-        return (i < end) & (greatest > layout.cutoffs.transmittance_min)
+        return (i < stop) & (greatest > layout.cutoffs.transmittance_min)
 
-    def step(i, T, state):
-        T, state = body(dr.gather(mi.UInt32, lists.ids, i), centres, T, state)
-        return i + 1, T, state
+    def step(i, depths, surfels, T, state):
+        listed = i < end
+        surfel = dr.gather(mi.UInt32, lists.ids, i, listed)
+        record = _fetch(records, surfel, layout.record, listed, layout.geometry)
+        # One surfel enters the queue, the nearest leaves it; after the list's end "farther than all" pushes the rest out.
+        depth = dr.select(listed, _Hit(record, *middle, layout.cutoffs).sort_key(record, layout.cutoffs), dr.inf)
+        for k in reversed(range(window)):
+            nearer = depth < depths[k]
+            depth, depths[k] = dr.minimum(depth, depths[k]), dr.maximum(depth, depths[k])
+            surfel, surfels[k] = dr.select(nearer, surfel, surfels[k]), dr.select(nearer, surfels[k], surfel)
+        T, state = body(surfel, depth > -dr.inf, centres, T, state)
+        return i + 1, depths, surfels, T, state
 
-    T = [mi.Float(1) for _ in pixels]
-    return dr.while_loop((first, T, state(len(pixels))), alive, step, label="splat")[2]
+    start = (first, [mi.Float(-dr.inf)] * window, [mi.UInt32(0)] * window, [mi.Float(1) for _ in pixels], state(len(pixels)))
+    return dr.while_loop(start, alive, step, label="splat")[4]
 
 
 def _image_rows(layout):
@@ -163,8 +199,8 @@ class Composite(dr.CustomOp):
         self.record, self.lists, self.layout = dr.detach(record), lists, layout
         n = layout.features
 
-        def body(surfel, centres, T, out):
-            r = _fetch(self.record, surfel, layout.record)
+        def body(surfel, valid, centres, T, out):
+            r = _fetch(self.record, surfel, layout.record, valid)
             features = r[len(GEOMETRY): len(GEOMETRY) + n]
             for k, (x, y) in enumerate(centres):
                 hit = _Hit(r, x, y, layout.cutoffs)
@@ -173,7 +209,7 @@ class Composite(dr.CustomOp):
                 T[k] = T[k] - w
             return T, out
 
-        out = _walk(lists, layout, lambda pixels: [[mi.Float(0)] * (n + 2) for _ in range(pixels)], body)
+        out = _walk(self.record, lists, layout, lambda pixels: [[mi.Float(0)] * (n + 2) for _ in range(pixels)], body)
         self.image = _scatter_image(out, layout)
         dr.eval(self.image)
         return self.image
@@ -187,8 +223,8 @@ class Composite(dr.CustomOp):
         gradient = dr.zeros(mi.Float, dr.width(self.record))
         stride = layout.record // PACKET
 
-        def body(surfel, centres, T, rest):
-            r = _fetch(self.record, surfel, layout.record)
+        def body(surfel, valid, centres, T, rest):
+            r = _fetch(self.record, surfel, layout.record, valid)
             features = r[len(GEOMETRY): len(GEOMETRY) + n]
             total = [mi.Float(0)] * layout.record
             for k, (x, y) in enumerate(centres):
@@ -204,18 +240,18 @@ class Composite(dr.CustomOp):
                 T[k] = T[k] - w
             for q in range(stride):
                 dr.scatter_reduce(dr.ReduceOp.Add, gradient, mi.Vector4f(*total[PACKET * q: PACKET * (q + 1)]),
-                                  surfel * stride + q, mode=dr.ReduceMode.Local)
+                                  surfel * stride + q, valid, mode=dr.ReduceMode.Expand)
             return T, rest
 
-        dr.eval(_walk(self.lists, layout, lambda pixels: rest, body))
+        dr.eval(_walk(self.record, self.lists, layout, lambda pixels: rest, body))
         self.set_grad_in("record", gradient)
 
     def forward(self):
         layout, n = self.layout, self.layout.features
         tangent = self.grad_in("record")
 
-        def body(surfel, centres, T, state):
-            r, r_ = (_fetch(b, surfel, layout.record) for b in (self.record, tangent))
+        def body(surfel, valid, centres, T, state):
+            r, r_ = (_fetch(b, surfel, layout.record, valid) for b in (self.record, tangent))
             values, values_ = (b[len(GEOMETRY): len(GEOMETRY) + n] for b in (r, r_))
             for k, (x, y) in enumerate(centres):
                 hit = _Hit(r, x, y, layout.cutoffs)
@@ -227,7 +263,7 @@ class Composite(dr.CustomOp):
             return T, state
 
         start = lambda pixels: [(mi.Float(0), [mi.Float(0)] * (n + 2)) for _ in range(pixels)]
-        state = _walk(self.lists, layout, start, body)
+        state = _walk(self.record, self.lists, layout, start, body)
         self.set_grad_out(_scatter_image([out_ for _, out_ in state], layout))
 
     def name(self):

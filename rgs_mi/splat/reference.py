@@ -9,36 +9,32 @@ import mitsuba as mi
 import numpy as np
 
 from .gbuffer import Maps
-from .lists import SORT_RADIUS
 from .project import NEAR
-from .tiles import LOW_PASS, TILE, Cutoffs
+from .tiles import LOW_PASS, PIXELS, Cutoffs
 
 
 def _front_to_back(surfels, camera) -> np.ndarray:
-    """[pixels, N] numbers of the surfels in front of the camera, by their depth on the ray through the centre of the pixel's
-    tile, which counts no farther than SORT_RADIUS standard deviations from their own centres."""
-    fields = surfels.numpy()
+    """[pixels, N] numbers of the surfels in front of the camera, by the depth at which the ray through the middle of the
+    pixel's PIXELS block meets them."""
     width, height = camera.size
-    centre = (fields["centers"].astype(np.float64) - camera.origin) @ camera.rotation.T
-    t_u, t_v, normal = (v.numpy().T.astype(np.float64) @ camera.rotation.T for v in surfels.frames())
+    fields = {name: value.astype(np.float64) for name, value in surfels.numpy().items()}
+    centre = (fields["centers"] - camera.origin) @ camera.rotation.T
     front = np.flatnonzero(centre[:, 2] > NEAR)
-    keys = np.empty((height, width, len(front)))
-    for row in range(0, height, TILE[1]):
-        for column in range(0, width, TILE[0]):
-            middle = np.array([column + TILE[0] / 2, row + TILE[1] / 2])
-            for k, i in enumerate(front):
-                c, z = centre[i], centre[i, 2]
-                offset = middle - (c[:2] / z * camera.focal + camera.principal)
-                ray = lambda s: np.append((c[:2] / z + s * offset / camera.focal), 1.0)
-                facing = c @ normal[i] / z  # of the ray through the surfel's centre
-                # where a small step along the offset leads on the surfel, continued linearly
-                step = 1e-6
-                hit = (c @ normal[i]) / (ray(step) @ normal[i]) * ray(step) - c
-                distance = np.hypot(hit @ t_u[i] / fields["scales"][i, 0], hit @ t_v[i] / fields["scales"][i, 1]) / step
-                shrink = min(1.0, SORT_RADIUS / max(distance, 1e-6))
-                slope = (ray(1.0) @ normal[i]) / facing - 1
-                keys[row:row + TILE[1], column:column + TILE[0], k] = z / np.clip(1 + shrink * slope, 0.5, 2)
-    return front[np.argsort(keys.reshape(width * height, -1), axis=1, kind="stable")].astype(np.uint32)
+    centre, scales = centre[front], fields["scales"][front]
+    t_u, t_v, normal = (v.numpy().T[front].astype(np.float64) @ camera.rotation.T for v in surfels.frames())
+    projected = centre[:, :2] / centre[:, 2:] * camera.focal + camera.principal
+
+    blocks = [np.arange(0, n, block) + block / 2 for n, block in zip(camera.size, PIXELS)]
+    middle = np.stack(np.meshgrid(*blocks), -1)[:, :, None]  # [rows, columns, 1, 2]
+    ray = np.concatenate([(middle - camera.principal) / camera.focal, np.ones((*middle.shape[:3], 1))], -1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = (centre * normal).sum(-1) / (ray * normal).sum(-1)  # [rows, columns, N]
+        offset = t[..., None] * ray - centre
+        on_plane = ((offset * t_u).sum(-1) / scales[:, 0]) ** 2 + ((offset * t_v).sum(-1) / scales[:, 1]) ** 2
+    on_screen = LOW_PASS * ((middle - projected) ** 2).sum(-1)
+    depth = np.where((t > 0) & (on_plane <= on_screen), t, centre[:, 2])
+    order = front[np.argsort(depth, axis=-1, kind="stable")]
+    return order.repeat(PIXELS[1], 0).repeat(PIXELS[0], 1)[:height, :width].reshape(width * height, -1).astype(np.uint32)
 
 
 def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> Maps:

@@ -20,11 +20,15 @@ LOW_PASS = 2.0
 @dataclass(frozen=True)
 class Cutoffs:
     """Weights below ``alpha_min`` are dropped, above ``alpha_max`` clamped; a pixel ends once its transmittance falls to
-    ``transmittance_min``. The defaults are 3DGS's; a finite-difference test wants them lifted."""
+    ``transmittance_min``. These defaults are 3DGS's; a finite-difference test wants them lifted.
+
+    ``window``: how many surfels a lane holds back to bring them into its own order. Fewer leave seams between tiles: on a
+    fitted helmet, two grids of tiles differ by 33 dB without any, by 37, 40 and 46 dB with 4, 8 and 16."""
 
     alpha_min: float = 1 / 255
     alpha_max: float = 0.99
     transmittance_min: float = 1e-4
+    window: int = 16
 
 
 def tile_grid(size):
