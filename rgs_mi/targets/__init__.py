@@ -1,7 +1,8 @@
 """Objects and environments of our own, made by code: what the path-traced data sets show.
 
 A model is a module of this package with `PARTS`, a dict from a part's name to a function that returns its
-`meshes.Mesh`; it is listed in `MODELS` below. Environments are listed in `environments.ENVIRONMENTS`.
+`meshes.Mesh`; it is listed in `MODELS` below. Parts are bodies, or the pieces of one that differ in material.
+Environments, a module each but for streets, are listed in `environments.ENVIRONMENTS`.
 Models are centred at the origin, z up, front towards +x, within a radius of about 1. Needs NumPy only.
 """
 
@@ -10,7 +11,7 @@ import importlib
 
 from ..errors import UserError
 
-MODELS = ("helmet",)
+MODELS = ("ball", "car", "coffee", "helmet", "teapot", "toaster")
 
 
 def pick(table: dict, name: str, what: str):

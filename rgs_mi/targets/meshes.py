@@ -18,6 +18,82 @@ class Mesh:
         used, faces = np.unique(self.faces[keep], return_inverse=True)
         return Mesh(self.vertices[used], faces.reshape(-1, 3).astype(np.uint32), self.normals[used])
 
+    def cut(self, value: np.ndarray) -> "Mesh":
+        """The same surface with edges along the curve where ``value`` [V] is zero; what is closed stays closed.
+
+        Where the curve passes close to a vertex it goes through the vertex, so that no sliver loses its area to rounding.
+        """
+        side, faces = np.sign(value), self.faces.astype(np.int64)
+        straddling = _straddling(side[faces])
+        ends = np.sort(faces[straddling][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2))
+        keys = np.unique(ends[:, 0] * len(value) + ends[:, 1])
+        low, high = keys // len(value), keys % len(value)
+        length = np.linalg.norm(self.vertices[low] - self.vertices[high], axis=1)
+        near = 0.04 * np.median(length) * np.abs(value[high] - value[low]) / length if len(keys) else 0
+        crossed = side[low] * side[high] < 0
+        for end in (low, high):
+            side[end[crossed & (np.abs(value[end]) < near)]] = 0
+
+        crossed = side[low] * side[high] < 0
+        keys, low, high = keys[crossed], low[crossed], high[crossed]
+        t = (value[low] / (value[low] - value[high]))[:, None]
+        mix = lambda x: x[low] + t * (x[high].astype(float) - x[low])
+        count = len(value)
+        at = lambda a, b: count + np.searchsorted(keys, np.minimum(a, b) * count + np.maximum(a, b))
+
+        sides = side[faces]
+        straddling = _straddling(sides)
+        through = straddling & (sides == 0).any(1)
+        pieces = [faces[~straddling]]
+        # The corner a is on the curve, which leaves through bc.
+        a, b, c = _rotated(faces[through], (sides[through] == 0).argmax(1))
+        pieces += [np.stack([a, b, at(b, c)], -1), np.stack([a, at(b, c), c], -1)]
+        # The corner a is alone on its side.
+        whole = straddling & ~through
+        a, b, c = _rotated(faces[whole], (sides[whole] == -np.sign(sides[whole].sum(1, keepdims=True))).argmax(1))
+        p, q = at(a, b), at(a, c)
+        pieces += [np.stack(triple, -1) for triple in ((a, p, q), (p, b, c), (p, c, q))]
+        return Mesh(np.concatenate([self.vertices, mix(self.vertices).astype(np.float32)]),
+                    np.concatenate(pieces).astype(np.uint32),
+                    np.concatenate([self.normals, unit(mix(self.normals)).astype(np.float32)]))
+
+    def moved(self, offset) -> "Mesh":
+        """Shifted by ``offset`` [3]."""
+        return Mesh(self.vertices + np.float32(offset), self.faces, self.normals)
+
+
+def _straddling(sides: np.ndarray) -> np.ndarray:
+    """[F] which faces have corners on both sides; sides [F, 3] are -1, 0 or 1."""
+    return (sides.min(1) < 0) & (sides.max(1) > 0)
+
+
+def _rotated(faces: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """[3, F] corners of faces [F, 3], each from the corner ``first`` [F] on."""
+    return faces[np.arange(len(faces))[:, None], (first[:, None] + [0, 1, 2]) % 3].T
+
+
+def divide(mesh: Mesh, regions, rest: str) -> dict[str, Mesh]:
+    """A surface cut into named parts with crisp borders.
+
+    Args:
+      regions: (name, fields) pairs; a region is where all its fields, callables from points [N, 3] to [N], are
+               negative. Where regions overlap, the first has it; a name may occur several times
+      rest:    name of what no region has
+    """
+    for field in dict.fromkeys(field for _, fields in regions for field in fields):
+        mesh = mesh.cut(field(mesh.vertices.astype(float)))
+    center = mesh.vertices[mesh.faces].mean(1, dtype=float)
+    names = list(dict.fromkeys([*(name for name, _ in regions), rest]))
+    owner = np.full(len(center), names.index(rest))
+    for name, fields in reversed(regions):
+        owner[np.logical_and.reduce([field(center) < 0 for field in fields])] = names.index(name)
+    return {name: mesh.select(owner == k) for k, name in enumerate(names)}
+
+
+def between(coordinate, low: float, high: float):
+    """Two fields for `divide`: where a coordinate (callable, [N, 3] to [N]) is between two values."""
+    return (lambda p: low - coordinate(p)), (lambda p: coordinate(p) - high)
+
 
 def unit(v: np.ndarray) -> np.ndarray:
     """[..., 3] vectors scaled to length 1 (0 stays 0)."""
@@ -88,6 +164,21 @@ def lathe(profile: np.ndarray, origin: np.ndarray, axis: np.ndarray, sides: int 
     c, s = _circle(sides)
     r, h = profile.T[:, :, None, None]
     return grid((origin + r * (c * x + s * y) + h * axis)[:, ::-1])
+
+
+def rounded(corners, cuts, steps: int = 8) -> np.ndarray:
+    """A profile [N, 2] for `lathe`: the polyline through corners [C, 2] with each corner rounded off.
+
+    cuts: float or [C], how far from the corner its arc begins; at most half a side.
+    """
+    corners = np.asarray(corners, float)
+    sides = np.linalg.norm(np.diff(corners, axis=0), axis=1)
+    cuts = np.minimum(np.broadcast_to(cuts, len(corners))[1:-1], 0.5 * np.minimum(sides[1:], sides[:-1]))[:, None, None]
+    before, corner, after = (x[:, None] for x in (corners[:-2], corners[1:-1], corners[2:]))
+    t = np.linspace(0, 1, steps)[:, None]
+    start, end = cuts * unit(before - corner), cuts * unit(after - corner)
+    arcs = corner + (1 - t) ** 2 * start + t**2 * end
+    return np.vstack([corners[:1], arcs.reshape(-1, 2), corners[-1:]])
 
 
 def join(*meshes: Mesh) -> Mesh:
