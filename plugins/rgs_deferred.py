@@ -12,6 +12,11 @@ what a principled BSDF with the G-buffer's material reflects of the environment 
    - ``split_sum``: the environment filtered by roughness times the directional albedo; ``none``: diffuse radiance only
      (Default: ``split_sum``)
 
+ * - shader
+   - |string|
+   - What a pixel makes of the specular radiance: the weights of a tiny network, an ``.npz`` that a fit with
+     ``shader: mlp`` wrote (`rgs_mi.shading.shader`); relative to the scene's folder (Default: none, the identity)
+
  * - hide_emitters
    - |bool|
    - Whether pixels show nothing behind the surfels, with their coverage as alpha, rather than the environment
@@ -30,8 +35,9 @@ coverage: divide by ``alpha.Y`` for means.
 
 The scene needs an ``envmap`` or ``constant`` emitter and a ``perspective`` sensor; other shapes and emitters are
 ignored. ``mi.render`` differentiates, in both modes, with respect to all fields of the surfels and the radiance of the
-environment, not to the sensor. Nothing is random: ``spp``, rounded up to a square, is the number of points of a regular
-grid in each pixel, over which the pixel is averaged whatever the film's reconstruction filter.
+environment, not to the sensor nor the shader's weights. Nothing is random: ``spp``, rounded up to a square, is the
+number of points of a regular grid in each pixel, over which the pixel is averaged whatever the film's reconstruction
+filter.
 """
 
 import math
@@ -44,10 +50,11 @@ from rgs_mi.camera import Camera
 from rgs_mi.errors import UserError
 from rgs_mi.shading import deferred, prefilter
 from rgs_mi.shading.environment import Environment, FilteredEnvironment
+from rgs_mi.shading.shader import Shader
 from rgs_mi.splat.gbuffer import render_gbuffer
 from rgs_mi.surfel import CHANNELS
 
-from .surfels import SurfelShape
+from .surfels import SurfelShape, resolve
 
 AOVS = {"depth": "T", "normal": "XYZ", "albedo": "RGB", "roughness": "Y", "metallic": "Y", "alpha": "Y",
         "specular": "RGB", "diffuse": "RGB"}
@@ -62,6 +69,8 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         self.specular = props.get("specular", "split_sum")
         if self.specular not in ESTIMATORS:
             raise UserError(f"rgs_deferred: unknown specular '{self.specular}': choose one of {', '.join(ESTIMATORS)}")
+        self.shader_file = resolve(props.get("shader", ""))
+        self.shader = Shader.load(self.shader_file) if self.shader_file else None
         self.aovs = [name.strip() for name in props.get("aovs", "").split(",") if name.strip()]
         if unknown := [name for name in self.aovs if name not in AOVS]:
             raise UserError(f"rgs_deferred: unknown aov '{unknown[0]}': choose from {', '.join(AOVS)}")
@@ -109,7 +118,8 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         filtered = self._filtered_environment(scene)
         gbuffer = render_gbuffer(surfels, camera)
         maps = gbuffer.all
-        image = deferred.shade(gbuffer, camera, None if self.specular == "none" else filtered, eta)
+        lighting = None if self.specular == "none" else deferred.Lighting(filtered, eta, self.shader)
+        image = deferred.shade(gbuffer, camera, lighting)
         rays = deferred.pixel_directions(camera, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]))
         color, alpha = image.color, maps.alpha
         if not self.hide_emitters and filtered is not None:

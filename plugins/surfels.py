@@ -70,7 +70,7 @@ class SurfelShape(mi.Mesh):
         super().__init__(props)
         if "to_world" in props:
             raise UserError(f"surfels '{self.id()}': 'to_world' is not supported: transform the file instead")
-        self.photographs = _resolve(props.get("photographs", ""))
+        self.photographs = resolve(props.get("photographs", ""))
         self.proxies = props.get("proxies", False)
         self.two_sided = props.get("two_sided", True)
         self.eta = _eta(self, props)
@@ -126,7 +126,7 @@ class SurfelShape(mi.Mesh):
         return f"Surfels[id = {self.id()}, count = {len(self.surfels)}, proxies = {self.proxies}]"
 
 
-def _resolve(path):
+def resolve(path: str) -> str:
     """``path`` as Mitsuba's own plugins find files: relative to the scene."""
     return str(mi.file_resolver().resolve(path)) if path else ""
 
@@ -134,7 +134,7 @@ def _resolve(path):
 def _load(props):
     """The fields of the PLY, or empty ones."""
     if "filename" in props:
-        return {name: mi.TensorXf(array) for name, array in read_ply(_resolve(props["filename"])).items()}
+        return {name: mi.TensorXf(array) for name, array in read_ply(resolve(props["filename"])).items()}
     return {name: dr.zeros(mi.TensorXf, (0, channels or 3)) for name, channels in CHANNELS.items()}
 
 

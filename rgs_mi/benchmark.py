@@ -16,7 +16,7 @@ from .fit import Fit
 from .run import start
 from .scene import FitScene
 from .splat.composite import Layout, composite
-from .splat.lists import tile_lists
+from .splat.lists import lane_lists
 from .splat.project import project
 from .surfel import Surfels, rotation_from_normal
 
@@ -63,8 +63,8 @@ def splat_times(surfels: Surfels, size: int) -> dict[str, float]:
     dr.eval(projected.geometry, projected.visible, features)
     layout = Layout(camera.size, FEATURES)
     adjoint = mi.Float(rng.normal(size=size * size * layout.pixel).astype(np.float32))
-    times = {"lists": _milliseconds(lambda: tile_lists(projected, camera.size, layout.cutoffs.alpha_min))}
-    lists = tile_lists(projected, camera.size, layout.cutoffs.alpha_min)
+    times = {"lists": _milliseconds(lambda: lane_lists(projected, camera.size, layout.cutoffs))}
+    lists = lane_lists(projected, camera.size, layout.cutoffs)
     times["forward"] = _milliseconds(lambda: dr.eval(composite(projected, features, lists, layout)))
 
     inputs = [*projected.geometry, *features]

@@ -29,13 +29,16 @@ class Gradients:
         return self.sum.numpy() / np.maximum(self.count.numpy(), 1)
 
 
-def densify(model, gradients: Gradients, extent: float, settings, rng, budget: int) -> None:
+def densify(model, gradients: Gradients, extent: float, settings, rng, budget: int, guided=None) -> None:
     """One round of density control, in place. ``extent``: radius of the object in world units; ``settings``: `Density`.
 
     Surfels whose mean gradient exceeds the threshold are cloned when small and split when large, the largest gradients
-    first while ``budget`` (surfels in all) lasts. Transparent, unseen and huge ones go.
+    first while ``budget`` (surfels in all) lasts; for those that are ``guided`` ([N] bool or None) half the threshold is
+    enough (RGS, Algorithm 1). Transparent, unseen and huge ones go.
     """
     gradient, seen = gradients.mean(), gradients.count.numpy() > 0
+    if guided is not None:
+        gradient = gradient * np.where(guided, 2, 1)
     opacity = 1 / (1 + np.exp(-model.numpy("logit_opacities")[:, 0]))
     scales = np.exp(model.numpy("log_scales"))
     largest = scales.max(1)

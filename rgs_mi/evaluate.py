@@ -9,7 +9,6 @@ import numpy as np
 from . import losses, metrics
 from .color import display
 from .shading import deferred
-from .shading.split_sum import DEFAULT_ETA
 
 #: Figures of one view; the mean over views has the same names.
 SCORES = ("psnr", "ssim", "normal_mae_deg")
@@ -30,13 +29,12 @@ class Rendering:
     maps: dict[str, np.ndarray]
 
 
-def render_view(surfels, filtered, camera, background, eta=DEFAULT_ETA) -> Rendering:
-    """Render ``surfels`` under a `FilteredEnvironment` (None: diffuse only) over the display-space grey level
-    ``background``."""
+def render_view(surfels, lighting, camera, background) -> Rendering:
+    """Render ``surfels`` under a `Lighting` (None: diffuse only) over the display-space grey level ``background``."""
     width, height = camera.size
     array = lambda v: np.atleast_2d(dr.detach(v).numpy()).T.reshape(height, width, -1)
     with dr.suspend_grad():
-        image = deferred.render(surfels, camera, filtered, eta=eta)
+        image = deferred.render(surfels, camera, lighting)
         m = image.gbuffer.all
         length = dr.norm(m.normal)
         normal = dr.select(length > 0, m.normal * (m.alpha / length), 0)
@@ -71,14 +69,14 @@ def _finite(value):
     return value if np.isfinite(value) else None
 
 
-def frames_per_second(surfels, filtered, cameras, eta=DEFAULT_ETA, frames=20) -> float:
+def frames_per_second(surfels, lighting, cameras, frames=20) -> float:
     """Views per second, G-buffer and shading, kernels compiled and the environment filtered beforehand: the median."""
     seconds = []
     with dr.suspend_grad():
         for k in range(frames + 1):
             dr.sync_thread()
             start = time.perf_counter()
-            dr.eval(deferred.render(surfels, cameras[k % len(cameras)], filtered, eta=eta).color)
+            dr.eval(deferred.render(surfels, cameras[k % len(cameras)], lighting).color)
             dr.sync_thread()
             seconds.append(time.perf_counter() - start)
     return float(1 / np.median(seconds[1:]))

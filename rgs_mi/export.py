@@ -1,4 +1,4 @@
-"""A fit as files that Mitsuba loads: surfels, environment, and the scene that puts them together."""
+"""A fit as files that Mitsuba loads: surfels, environment, shader, and the scene that puts them together."""
 
 import copy
 import warnings
@@ -11,7 +11,7 @@ import numpy as np
 from .checkpoint import atomic_file
 from .ply import write_ply
 
-SURFELS, ENVIRONMENT, SCENE = "object.ply", "environment.exr", "scene.xml"
+SURFELS, ENVIRONMENT, SHADER, SCENE = "object.ply", "environment.exr", "shader.npz", "scene.xml"
 
 
 def write_exr(path, pixels: np.ndarray, channels=None):
@@ -25,8 +25,9 @@ def write_exr(path, pixels: np.ndarray, channels=None):
         stream.write(memory.raw_buffer())
 
 
-def export(folder, scene, surfels, environment, views) -> list[Path]:
-    """Write ``object.ply``, ``environment.exr`` and ``scene.xml`` into ``folder`` and return their paths.
+def export(folder, scene, surfels, environment, shader, views) -> list[Path]:
+    """Write ``object.ply``, ``environment.exr``, ``shader.npz`` (where ``shader`` is not None, the identity) and
+    ``scene.xml`` into ``folder`` and return their paths.
 
     The scene is the one that was fitted (a `FitScene`) with the results in place of where the fit started, and a sensor
     for each of ``views``, whose id is the view's name: ``mi.render(mi.load_file("scene.xml"), sensor=i)``.
@@ -35,14 +36,16 @@ def export(folder, scene, surfels, environment, views) -> list[Path]:
     folder = Path(folder)
     write_ply(folder / SURFELS, surfels.numpy())
     write_exr(folder / ENVIRONMENT, environment.texels.numpy())
-    root = _fitted(scene, surfels, environment)
+    if shader:
+        shader.save(folder / SHADER)
+    root = _fitted(scene, surfels, environment, shader)
     if any(abs(v.camera.focal[0] / v.camera.focal[1] - 1) > 1e-4 for v in views):
         warnings.warn(f"{folder / SCENE}: the cameras' pixels are not square, those of its sensors are", stacklevel=2)
     root.extend(_sensor(view) for view in views)
     ET.indent(root, "    ")
     with atomic_file(folder / SCENE) as stream:
         ET.ElementTree(root).write(stream, encoding="utf-8", xml_declaration=True)
-    return [folder / SCENE, folder / SURFELS, folder / ENVIRONMENT]
+    return [folder / name for name in (SCENE, SURFELS, ENVIRONMENT, *([SHADER] if shader else []))]
 
 
 def sensor_id(name: str) -> str:
@@ -50,7 +53,7 @@ def sensor_id(name: str) -> str:
     return name.replace(".", "_")
 
 
-def _fitted(scene, surfels, environment):
+def _fitted(scene, surfels, environment, shader):
     """The scene's XML with results in place of photographs and of the starting light, and without sensors."""
     root = copy.deepcopy(scene.root)
     for sensor in root.findall("sensor"):
@@ -62,6 +65,11 @@ def _fitted(scene, surfels, environment):
     emitter = scene.emitter_element(root)
     emitter[:] = [_element("string", "filename", ENVIRONMENT), _transform(environment.rotation)]
     emitter.set("type", "envmap")
+    integrator = scene.integrator_element(root)
+    for element in integrator.findall("*[@name='shader']"):
+        integrator.remove(element)
+    if shader:
+        integrator.append(_element("string", "shader", SHADER))
     for default in root.findall("default"):
         name = default.get("name")
         default.set("value", scene.variables.get(name, default.get("value")))

@@ -8,7 +8,6 @@ from .shading.deferred import COVERED
 from .splat.project import opaque
 
 SATURATED = 0.995  # display value from which a photograph only says "at least this bright"
-CREASE = 0.1  # difference of unit normals from pixel to pixel that counts as an edge
 _WINDOW, _SIGMA = 11, 1.5  # SSIM's Gaussian window
 _C1, _C2 = 0.01**2, 0.03**2
 _FLAT = 1e-6  # standard deviation of a depth map, in units of its depth, up to which it is constant
@@ -123,18 +122,31 @@ def depth_normal_consistency(gbuffer, camera):
     return dr.sum(1 - dr.dot(n, n_depth)) / (width * height)
 
 
-def normal_smoothness(gbuffer):
-    """Mean over the covered pixels of the squared forward differences of N (RGS, L_normal, before its mask), each limited
-    by d² / (1 + d²/CREASE²): noise of a few degrees is smoothed, an edge of the object is let be."""
+def normal_smoothness(gbuffer, roughest, crease=0.0):
+    """RGS's L_normal: mean squared forward difference of N from pixel to pixel, over the pixels whose mean roughness is at
+    most ``roughest`` (an opaque ``mi.Float``), both of them. With ``crease``, d² counts as d² / (1 + d²/crease²): noise of
+    a few degrees is smoothed, an edge of the object is let be."""
     width, height = gbuffer.size
     index = _interior(gbuffer)
     if dr.width(index) == 0:
         return mi.Float(0)
-    normal = lambda i: gbuffer.maps(i).normal
-    here = normal(index)
-    limited = lambda d2: d2 / (1 + d2 / CREASE**2)
-    difference = sum(limited(dr.squared_norm(normal(index + step) - here)) for step in (1, width))
-    return dr.sum(difference) * dr.opaque(mi.Float, 1 / dr.width(index))  # a literal would recompile at every count
+    total, pairs = mi.Float(0), mi.Float(0)
+    here = gbuffer.maps(index)
+    smooth = lambda m: dr.detach(m.roughness) <= roughest * dr.detach(m.alpha)
+    for step in (1, width):
+        there = gbuffer.maps(index + step)
+        d2 = dr.squared_norm(there.normal - here.normal)
+        counted = smooth(here) & smooth(there)
+        total += dr.sum(dr.select(counted, d2 / (1 + d2 / crease**2) if crease > 0 else d2, 0))
+        pairs += mi.Float(dr.count(counted))
+    return 2 * total / dr.maximum(pairs, 1)
+
+
+def delta_normal(gbuffer):
+    """RGS's L_Δn: mean ‖ΔN‖ over the image."""
+    length2 = dr.squared_norm(gbuffer.all.delta_normal)
+    nonzero = length2 > 0
+    return dr.sum(dr.select(nonzero, dr.sqrt(dr.select(nonzero, length2, 1)), 0)) / (gbuffer.size[0] * gbuffer.size[1])
 
 
 def pearson_depth(depth, prior, valid, inverse=False):

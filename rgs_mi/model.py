@@ -1,4 +1,4 @@
-"""What a fit learns: surfels and environment in unconstrained form, and the optimiser that moves them."""
+"""What a fit learns: surfels, environment and shader in unconstrained form, and the optimiser that moves them."""
 
 import drjit as dr
 import mitsuba as mi
@@ -6,12 +6,13 @@ import numpy as np
 
 from .aligned import lanes, tensor
 from .shading.environment import Environment
+from .shading.shader import Shader, initial_weights
 from .surfel import Surfels
 
-#: Unconstrained parameters, a row a surfel. The last is the environment's.
+#: Unconstrained parameters, a row a surfel.
 SURFEL_PARAMETERS = ("centers", "rotations", "log_scales", "logit_opacities", "sh_dc", "sh_rest", "logit_base_color",
                      "logit_roughness", "logit_metallic", "delta_normal")
-ENVIRONMENT = "log_environment"
+ENVIRONMENT, SHADER = "log_environment", "shader"
 #: The step of 3DGS's optimisers is relative to the gradient's own size, however small.
 _EPSILON = 1e-15
 _LOG_RADIANCE = (-9.0, 8.0)  # texels that no ray tells apart would else drift to overflow
@@ -29,10 +30,11 @@ def _sigmoid(x):
 
 
 class Model:
-    """Surfels and environment as Adam sees them.
+    """Surfels, environment and shader as Adam sees them.
 
-    ``parameters``: NumPy arrays [N, channels] named as `SURFEL_PARAMETERS`, and `ENVIRONMENT` [rows, columns, 3], the
-    logarithm of radiance. ``rotation``: [3, 3] environment frame to world frame. ``two_sided``: see `Surfels`.
+    ``parameters``: NumPy arrays [N, channels] named as `SURFEL_PARAMETERS`, `ENVIRONMENT` [rows, columns, 3], the
+    logarithm of radiance, and `SHADER` [weights], unless f_φ is the identity. ``rotation``: [3, 3] environment frame to
+    world frame. ``two_sided``: see `Surfels`.
     """
 
     def __init__(self, parameters: dict, rotation: np.ndarray, two_sided: bool = True):
@@ -42,10 +44,11 @@ class Model:
             self.optimizer[name] = tensor(value)
 
     @classmethod
-    def start(cls, positions, normals, colors, spacing, environment, rotation, sh_order, seed=0, scale=1.0):
+    def start(cls, positions, normals, colors, spacing, environment, rotation, sh_order, seed=0, scale=1.0,
+              roughness=0.3, shader="identity"):
         """Surfels at ``positions`` [N, 3], facing ``normals`` [N, 3] (outward, one-sided; None: random, two-sided), of
-        ``colors`` [N, 3] (linear), as wide as ``scale`` times their ``spacing`` [N]; ``environment`` [rows, columns, 3]
-        radiance to start from."""
+        ``colors`` [N, 3] (linear), as wide as ``scale`` times their ``spacing`` [N], all of one ``roughness``;
+        ``environment`` [rows, columns, 3] radiance to start from; ``shader``: as `Settings` has it."""
         from .surfel import rotation_from_normal
 
         n, rng = len(positions), np.random.default_rng(seed)
@@ -60,10 +63,11 @@ class Model:
             "sh_dc": (0.5 * colors - 0.5) / 0.28209479,
             "sh_rest": np.zeros((n, 3 * ((sh_order + 1) ** 2 - 1))),
             "logit_base_color": np.full((n, 3), logit(0.5)),
-            "logit_roughness": np.full((n, 1), logit(0.3)),
+            "logit_roughness": np.full((n, 1), logit(roughness)),
             "logit_metallic": np.full((n, 1), logit(0.4)),
             "delta_normal": np.zeros((n, 3)),
             ENVIRONMENT: np.log(np.maximum(environment, 1e-3)),
+            **({SHADER: initial_weights(seed)} if shader == "mlp" else {}),
         }, rotation, two_sided=normals is None)
 
     def __len__(self):
@@ -86,6 +90,10 @@ class Model:
     def environment(self) -> Environment:
         """The environment, non-negative by construction."""
         return Environment(dr.exp(dr.clip(self.optimizer[ENVIRONMENT], *_LOG_RADIANCE)), self.rotation)
+
+    def shader(self) -> Shader | None:
+        """f_φ; None: the identity."""
+        return Shader(self.optimizer[SHADER]) if SHADER in self.optimizer else None
 
     # ---- Surgery ----
 
@@ -130,7 +138,7 @@ class Model:
     @classmethod
     def from_state(cls, arrays: dict) -> "Model":
         """The model that wrote ``state()``."""
-        names = [*SURFEL_PARAMETERS, ENVIRONMENT]
+        names = [name for name in (*SURFEL_PARAMETERS, ENVIRONMENT, SHADER) if name in arrays]
         model = cls({name: arrays[name] for name in names}, arrays["rotation"], arrays["two_sided"])
         for name in names:
             model._set_moments(name, mi.UInt32(int(arrays[f"{name}.t"])), *(lanes(arrays[f"{name}.{k}"]) for k in "mv"))

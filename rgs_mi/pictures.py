@@ -43,7 +43,7 @@ def write_view(folder, view, rendering: Rendering, background, gbuffer: bool):
 def contact_sheet(path, rows, environment: np.ndarray, background, title: str, lines):
     """One picture of the fit: a row for each (view, `Rendering`) of ``rows``, cropped to the object; below them the
     ``environment`` [rows, columns, 3] and beside it ``lines`` of text."""
-    rows = [_crop(_panels(view, rendering, background), view) for view, rendering in rows]
+    rows = [crop(_panels(view, rendering, background), view) for view, rendering in rows]
     names = list(dict.fromkeys(name for row in rows for name in row))
     step, line = _PANEL + _GAP, round(1.6 * _TEXT)
     heights = [round(_PANEL * image.shape[0] / image.shape[1]) for image in (row["photograph"] for row in rows)]
@@ -72,7 +72,7 @@ def contact_sheet(path, rows, environment: np.ndarray, background, title: str, l
         sheet.save(stream, "PNG")
 
 
-def _crop(panels, view):
+def crop(panels, view):
     """The square around the object where the view has a mask, else the whole."""
     if not view.masked:
         return panels

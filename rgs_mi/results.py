@@ -16,7 +16,7 @@ from .config import to_dict
 from .export import export
 from .progress import Progress
 
-METRICS, SHEET = "metrics.json", "contact_sheet.png"
+METRICS, SHEET, GUIDED = "metrics.json", "contact_sheet.png", "guided.png"
 SHEET_ROWS, GBUFFERS = 4, 4  # test views on the sheet, and with their G-buffers written
 _NO_LPIPS = "not measured: this version has no LPIPS weights"
 
@@ -32,19 +32,21 @@ def write(fit, scene, folder, quiet):
     background = fit.settings.background
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
-        exported = export(folder, scene, surfels, environment, views)
-        filtered = fit.filtered()
+        exported = export(folder, scene, surfels, environment, fit.model.shader(), views)
+        lighting = fit.lighting()
     scores, rows = {}, []
     on_sheet = {int(k) for k in np.linspace(0, len(views) - 1, SHEET_ROWS + 2)[1:-1].round()}
     with Progress(None, quiet, "evaluating") as progress:
         for k, view in enumerate(views):
-            rendering = evaluate.render_view(surfels, filtered, view.camera, background, fit.eta)
+            rendering = evaluate.render_view(surfels, lighting, view.camera, background)
             pictures.write_view(folder / "test", view, rendering, background, gbuffer=k < GBUFFERS)
             scores[view.name] = evaluate.score(view, rendering, background)
             if k in on_sheet:
                 rows.append((view, rendering))
             progress.update((k + 1) / len(views))
-    fps = evaluate.frames_per_second(surfels, filtered, [view.camera for view in views], fit.eta)
+    if (guided := fit.guided_picture()) is not None:
+        pictures.write_png(folder / GUIDED, guided / 255)
+    fps = evaluate.frames_per_second(surfels, lighting, [view.camera for view in views])
     mean = evaluate.mean_scores(list(scores.values()) if held_out else [])
     figures = _figures(fit, mean, fps) | {"views": scores if held_out else {}}
     with checkpoint.atomic_file(folder / METRICS) as stream:

@@ -16,9 +16,11 @@ from .fit import Fit
 from .initial import initial_points
 from .interrupt import GracefulInterrupt
 from .model import Model
+from .priors import depth_priors
 from .progress import Progress
 from .scene import FitScene
 
+_PRIORS = Path("data") / "priors"  # what is known of depths is kept here, below the current folder
 _SMOOTHING = 0.95  # of the PSNR that the progress line shows
 
 
@@ -71,8 +73,15 @@ def start(scene, dataset, settings) -> Fit:
     extent = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
     light = scene.environment
     model = Model.start(positions, normals, colors, spacing, light.texels.numpy(), light.rotation, settings.sh_order,
-                        settings.seed, settings.start.scale)
-    return Fit(dataset, model, settings, extent, scene.specular, scene.eta)
+                        settings.seed, settings.start.scale, settings.start.roughness, settings.shader)
+    return Fit(dataset, model, settings, extent, scene.specular, scene.eta, _priors(dataset, settings))
+
+
+def _priors(dataset, settings):
+    """The depth prior of each training view, or None."""
+    if settings.weights.depth == 0:
+        return None
+    return depth_priors(settings.prior.name, dataset.train, cache=_PRIORS, **settings.prior.options)
 
 
 def _resume(saved, scene, dataset, settings) -> Fit:
@@ -80,14 +89,15 @@ def _resume(saved, scene, dataset, settings) -> Fit:
     arrays, meta = saved
     if meta["photographs"] != _photographs(dataset):
         raise UserError(f"{dataset.root}: not the photographs of the checkpoint: give its --data, or another --out")
-    old, new = _flat(meta["settings"]), _flat(_plain(to_dict(settings)))
+    old, new = {"shader": "identity"} | _flat(meta["settings"]), _flat(_plain(to_dict(settings)))
     changed = [key for key in new if old.get(key) != new[key]]
-    if "sh_order" in changed:
-        raise UserError(f"sh_order is {old['sh_order']} in the checkpoint and can't change: choose another --out")
+    if fixed := [key for key in ("sh_order", "shader") if key in changed]:
+        raise UserError(f"{fixed[0]} is {old[fixed[0]]} in the checkpoint and can't change: choose another --out")
     if changed:
         listing = ", ".join(f"{key} {old.get(key)} -> {new[key]}" for key in changed)
         print(f"settings differ from the checkpoint's, the new ones hold: {listing}", file=sys.stderr)
-    return Fit.resume(dataset, settings, arrays, meta, specular=scene.specular, eta=scene.eta)
+    return Fit.resume(dataset, settings, arrays, meta, specular=scene.specular, eta=scene.eta,
+                      priors=_priors(dataset, settings))
 
 
 def _photographs(dataset) -> list:

@@ -60,10 +60,15 @@ class FitScene:
         if scene.environment() is None:
             raise UserError(f"{path}: has no 'envmap' or 'constant' emitter: it says where the fit of the light starts")
         root = _parse(path)
-        if cls.surfels_element(root) is None or cls.emitter_element(root) is None:
-            raise UserError(f"{path}: surfels and environment must stand in this file, not in one it includes")
+        if None in (cls.integrator_element(root), cls.surfels_element(root), cls.emitter_element(root)):
+            raise UserError(f"{path}: integrator, surfels and environment must stand in this file, not in one it includes")
         return cls(path, root, variables, Path(surfels.photographs), Environment.from_emitter(scene.environment()),
                    integrator.specular, surfels.eta)
+
+    @staticmethod
+    def integrator_element(root):
+        """The element of the integrator in the XML, or None."""
+        return root.find("integrator[@type='rgs_deferred']")
 
     @staticmethod
     def surfels_element(root):

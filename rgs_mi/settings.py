@@ -1,6 +1,7 @@
 """How to fit: every number of the schedule, with defaults that suit two CPU cores. YAML files and --set change them."""
 
 from dataclasses import dataclass, field
+from typing import Any, Literal
 
 
 def _within(default, low, high):
@@ -22,6 +23,7 @@ class Start:
 
     surfels: int = _within(25_000, 1, 10_000_000)
     scale: float = _within(0.8, 0.01, 10)  # standard deviation over the distance to the neighbours
+    roughness: float = _within(0.3, 0, 1)
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,7 @@ class Rates:
     metallic: tuple[float, float] = (2e-2, 4e-3)
     delta_normal: tuple[float, float] = (1e-3, 1e-4)
     environment: tuple[float, float] = (3e-2, 5e-3)
+    shader: tuple[float, float] = (1e-2, 1e-3)
 
 
 @dataclass(frozen=True)
@@ -48,8 +51,19 @@ class Weights:
     dssim: float = _within(0.2, 0, 1)  # of D-SSIM against L1
     mask: float = _within(0.1, 0, 1e3)
     # depth-normal consistency (2DGS), first and last, joined geometrically: early on it would hold the surface back
-    consistency: tuple[float, float] = _within((0.05, 0.6), 1e-6, 1e3)
-    smoothness: float = _within(0.1, 0, 1e3)  # of rendered normals
+    consistency: tuple[float, float] = _within((0.05, 0.6), 0, 1e3)
+    normal: float = _within(0.1, 0, 1e3)  # smoothness of the normals of what is reflective (RGS, L_normal)
+    crease: float = _within(0.1, 0, 1e3)  # difference of unit normals from pixel to pixel that it lets be; 0: none
+    delta_normal: float = _within(0.0, 0, 1e3)  # length of the normals' residuals (RGS, L_Δn)
+    depth: float = _within(1e-3, 0, 1e3)  # correlation with the depth prior (RGS, L_depth)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Where the depth prior of the photographs comes from, and the options of its function (`priors`)."""
+
+    name: Literal["hull", "files", "vggt", "none"] = "none"
+    options: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -63,6 +77,7 @@ class Density:
     dense: float = _within(0.01, 0, 1)  # surfels smaller than this (in units of the object) are cloned, others split
     prune_opacity: float = _within(0.05, 0, 1)
     max_surfels: int = _within(50_000, 1, 10_000_000)
+    guided: bool = False  # half the threshold where two views or more see something reflective (RGS, Algorithm 1)
 
 
 @dataclass(frozen=True)
@@ -73,6 +88,9 @@ class Settings:
     iterations: int | None = _within(None, 1, 10_000_000)
     seed: int = _within(0, 0, 2**31)
     background: float = _within(1.0, 0, 1)  # display grey level behind masked objects, in training and in figures
+    specular_start: float = _within(0.0, 0, 1)  # fraction of the fit from which reflections are shaded; 1: never
+    reflective: float = _within(0.9, 0, 1)  # the fraction of a view's foreground, smoothest first, that is reflective
+    shader: Literal["identity", "mlp"] = "identity"  # f_φ of C = C_d + f_φ(C_s): nothing, or a tiny network trained along
     sh_order: int = _within(2, 0, 3)
     sh_start: float = _within(0.4, 0, 1)  # fraction of the fit from which view-dependent diffuse is learned
     checkpoint_seconds: float = _within(20, 0, 1e6)
@@ -80,4 +98,5 @@ class Settings:
     start: Start = Start()
     rates: Rates = Rates()
     weights: Weights = Weights()
+    prior: Prior = Prior()
     density: Density = Density()

@@ -10,9 +10,11 @@ import pytest
 import rgs_mi
 from rgs_mi import losses
 from rgs_mi.density import Gradients
-from rgs_mi.fit import Fit, Photographs
+from rgs_mi.fit import Fit
 from rgs_mi.model import Model
-from rgs_mi.settings import Density, Settings, Stage, Start
+from rgs_mi.photographs import Photographs
+from rgs_mi.priors import DepthPrior
+from rgs_mi.settings import Density, Rates, Settings, Stage, Start, Weights
 from rgs_mi.shading import deferred
 from rgs_mi.shading.environment import Environment
 from rgs_mi.surfel import Surfels
@@ -41,7 +43,7 @@ def dataset():
     views = []
     for k in range(6):
         camera = orbit_camera(k, size=(83, 75), distance=9.0)
-        image = deferred.render(truth, camera, light.environment().filtered())
+        image = deferred.render(truth, camera, deferred.Lighting(light.environment().filtered()))
         alpha = image.gbuffer.all.alpha.numpy().reshape(75, 83, 1)
         shown = losses.display(image.color, image.gbuffer.all.alpha, 0.0).numpy().T.reshape(75, 83, 3)
         straight = shown / np.maximum(alpha, 1e-3)
@@ -54,18 +56,32 @@ def dataset():
 def test_crops_hold_the_object_and_their_cameras_fit(dataset, downscale):
     photographs = Photographs(dataset.train, downscale, 1.0)
     sizes = set()
-    surfels, light = sphere_surfels(300, seed=2, scale=0.9, opacity_shift=4), model().environment().filtered()
+    surfels = sphere_surfels(300, seed=2, scale=0.9, opacity_shift=4)
+    lighting = deferred.Lighting(model().environment().filtered())
     surfels = Surfels.from_numpy(surfels.numpy(), two_sided=False)
     for i, view in enumerate(dataset.train):
-        camera, color, alpha, whole = photographs[i]
-        sizes.add(camera.size)
-        assert whole == tuple(n // downscale for n in view.camera.size)
+        photo = photographs[i]
+        alpha = photo.alpha
+        sizes.add(photo.camera.size)
+        assert photo.size == tuple(n // downscale for n in view.camera.size)
         full = view.pixels[..., 3].astype(float) / 255
         assert alpha.numpy().sum() * downscale**2 == pytest.approx(full.sum(), rel=0.01)
-        rendered = deferred.render(surfels, camera, light).gbuffer.all.alpha.numpy()
+        rendered = deferred.render(surfels, photo.camera, lighting).gbuffer.all.alpha.numpy()
         assert np.abs(rendered - alpha.numpy()).mean() < 0.03  # a camera that is off by a pixel gives more
     assert len(sizes) == 1
     assert downscale > 1 or np.prod(sizes.pop()) < 0.8 * 83 * 75
+
+
+@pytest.mark.parametrize("downscale", [1, 2])
+def test_priors_are_cropped_like_photographs(dataset, downscale):
+    """A prior that is the mask itself, with a hole."""
+    values = [np.where(v.pixels[..., 3] > 127, v.pixels[..., 3] / 255, np.nan).astype(np.float32) for v in dataset.train]
+    photographs = Photographs(dataset.train, downscale, 1.0, [DepthPrior(v, inverse=True) for v in values])
+    photo = photographs[2]
+    prior, alpha = photo.prior.numpy(), photo.alpha.numpy()
+    assert photo.inverse and prior.shape == alpha.shape and np.isnan(prior[alpha < 0.2]).all()
+    assert np.abs(prior - alpha)[(alpha > 0.9) & np.isfinite(prior)].max() < 0.15
+    assert Photographs(dataset.train, downscale, 1.0)[2].prior is None
 
 
 def test_a_fit_gets_better(dataset):
@@ -76,6 +92,48 @@ def test_a_fit_gets_better(dataset):
         fit.step()
     assert fit.psnr > first + 2
     assert fit.views_used == fit.step_number == 40
+
+
+def test_a_wrong_depth_prior_bends_the_surface(dataset):
+    """A plane as the prior and a great weight: the rendered depth takes its slope."""
+    rows = np.broadcast_to(np.arange(75, dtype=np.float32)[:, None], (75, 83))
+    settings = replace(SETTINGS, weights=Weights(dssim=0, mask=0, normal=0, depth=10), rates=Rates(centers=(5e-3, 5e-3)))
+    correlation = {}
+    for sign in (1, -1):
+        fit = Fit(dataset, model(), settings, 1.0, priors=[DepthPrior(sign * rows)] * 6)
+        while fit.progress < 1:
+            fit.step()
+        maps = deferred.render(fit.model.surfels(0), dataset.train[0].camera, None).gbuffer.all
+        alpha = maps.alpha.numpy()
+        depth = (maps.depth.numpy() / np.maximum(alpha, 1e-3))[alpha > 0.5]
+        correlation[sign] = np.corrcoef(depth, rows.ravel()[alpha > 0.5])[0, 1]
+    assert correlation[1] > correlation[-1] + 0.2
+
+
+def test_specular_starts_late(dataset):
+    fit = Fit(dataset, model(), replace(SETTINGS, specular_start=0.5), 1.0)
+    before = fit.model.numpy("log_environment")
+    changed = []
+    while fit.progress < 1:
+        fit.step()
+        changed.append(not np.array_equal(before, fit.model.numpy("log_environment")))
+    assert not any(changed[:19]) and changed[-1]
+    assert Fit(dataset, model(), replace(SETTINGS, specular_start=1.0), 1.0).specular == "none"
+
+
+def test_guided_surfels_need_half_the_gradient(dataset):
+    """What is reflective covers the object here, so all surfels are guided, and more of them pass the threshold."""
+    grown = {}
+    for guided in (False, True):
+        density = Density(start=0.0, stop=1.0, interval=20, threshold=2e-3, guided=guided, max_surfels=10_000)
+        fit = Fit(dataset, model(), replace(SETTINGS, iterations=21, density=density), 1.0)
+        while fit.progress < 1:
+            fit.step()
+        grown[guided] = len(fit.model)
+        picture = fit.guided_picture()
+        assert (picture is not None) == guided
+        assert not guided or len(np.unique(picture.reshape(-1, 3), axis=0)) > 10
+    assert grown[True] > grown[False] > 0
 
 
 def test_without_specular_the_environment_stays(dataset, monkeypatch):

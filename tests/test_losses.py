@@ -87,7 +87,35 @@ def test_nothing_covered_costs_nothing():
     arrays["centers"] = arrays["centers"] + 100
     from rgs_mi.surfel import Surfels
     gbuffer = render_gbuffer(Surfels.from_numpy(arrays), camera)
-    assert losses.depth_normal_consistency(gbuffer, camera)[0] == 0 and losses.normal_smoothness(gbuffer)[0] == 0
+    assert losses.depth_normal_consistency(gbuffer, camera)[0] == 0
+    assert losses.normal_smoothness(gbuffer, mi.Float(1))[0] == 0
+
+
+@pytest.mark.parametrize("crease", [0.0, 0.1])
+def test_normal_smoothness_equals_numpy(crease):
+    """Pairs of covered pixels, both of them smooth, in both directions."""
+    surfels, camera = sphere_surfels(400, scale=1.0, opacity_shift=3), orbit_camera(size=(48, 40))
+    gbuffer = render_gbuffer(surfels, camera)
+    image = lambda v: v.numpy().T.reshape(40, 48, -1)
+    normal, alpha, roughness = (image(v) for v in (gbuffer.all.normal, gbuffer.all.alpha, gbuffer.all.roughness))
+    covered = np.pad(alpha[..., 0] > 0.5, 1)
+    inner = covered[1:-1, 1:-1] & covered[:-2, 1:-1] & covered[2:, 1:-1] & covered[1:-1, :-2] & covered[1:-1, 2:]
+    inner[[0, -1]] = inner[:, [0, -1]] = False
+    smooth = (roughness <= 0.5 * alpha)[..., 0]
+    limited = lambda d2: d2 / (1 + d2 / crease**2) if crease else d2
+    pairs = np.concatenate([
+        limited(((np.roll(normal, -1, axis) - normal) ** 2).sum(-1))[inner & smooth & np.roll(smooth, -1, axis)]
+        for axis in (0, 1)])
+    expected = 2 * pairs.mean()
+    assert len(pairs) > 100
+    assert losses.normal_smoothness(gbuffer, mi.Float(0.5), crease)[0] == pytest.approx(expected, rel=1e-4)
+
+
+def test_delta_normal_is_its_mean_length():
+    surfels, camera = sphere_surfels(50), orbit_camera(size=(32, 32))
+    gbuffer = render_gbuffer(surfels, camera)
+    expected = np.linalg.norm(gbuffer.all.delta_normal.numpy(), axis=0).mean()
+    assert losses.delta_normal(gbuffer)[0] == pytest.approx(expected, rel=1e-5)
 
 
 # ---- The depth prior ----

@@ -110,7 +110,7 @@ def test_gradients_equal_finite_differences(entry):
         texels = mi.TensorXf(arrays["texels"])
         for value in [*(getattr(surfels, n) for n in CHANNELS), texels]:
             dr.enable_grad(value)
-        image = deferred.render(surfels, camera, Environment(texels, np.eye(3)).filtered())
+        image = deferred.render(surfels, camera, deferred.Lighting(Environment(texels, np.eye(3)).filtered()))
         return image, surfels, texels
 
     image, surfels, texels = render(base)

@@ -1,6 +1,6 @@
-"""From G-buffer to image: C = C_d + f_φ(C_s) per covered pixel (`method.md` §3), f_φ the identity."""
+"""From G-buffer to image: C = C_d + f_φ(C_s) per covered pixel (`method.md` §3)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -8,8 +8,27 @@ import mitsuba as mi
 from ..splat.gbuffer import render_gbuffer
 from ..splat.project import opaque
 from . import split_sum
+from .environment import FilteredEnvironment
+from .shader import Shader
 
 COVERED = 4e-3  # pixels with less alpha are left empty
+
+
+@dataclass
+class Lighting:
+    """What surfels reflect, and how: the environment, their index of refraction, and f_φ (None: the identity)."""
+
+    filtered: FilteredEnvironment
+    eta: float = split_sum.DEFAULT_ETA
+    shader: Shader | None = None
+
+    def learned(self) -> list:
+        """The arrays that a fit changes: filtered texels, and the weights of the shader where there is one."""
+        return [self.filtered.texels, *([self.shader.weights] if self.shader else [])]
+
+    def with_learned(self, arrays) -> "Lighting":
+        """The same with other ``arrays`` in place of `learned`."""
+        return replace(self, filtered=replace(self.filtered, texels=arrays[0]), shader=self.shader and Shader(arrays[1]))
 
 
 @dataclass
@@ -32,28 +51,32 @@ def pixel_directions(camera, index):
     return dr.normalize(R.T @ mi.Vector3f(x, y, 1))
 
 
-def shade(gbuffer, camera, filtered, eta=split_sum.DEFAULT_ETA) -> Image:
-    """Shade a G-buffer under a `FilteredEnvironment`; None: diffuse radiance only."""
+def shade(gbuffer, camera, lighting: Lighting | None) -> Image:
+    """Shade a G-buffer; without ``lighting``: diffuse radiance only."""
     diffuse = gbuffer.all.diffuse
-    if filtered is None:
+    if lighting is None:
         return Image(diffuse, diffuse, dr.zeros(mi.Color3f, camera.size[0] * camera.size[1]), gbuffer)
-    specular = _specular(gbuffer, camera, filtered, eta)
+    specular = _specular(gbuffer, camera, lighting)
     return Image(diffuse + specular, diffuse, specular, gbuffer)
 
 
-def _specular(gbuffer, camera, filtered, eta):
-    """C_s times coverage, a lane a pixel. Only covered pixels are computed."""
+def _specular(gbuffer, camera, lighting):
+    """f_φ(C_s) times coverage, a lane a pixel. Only covered pixels are computed."""
     specular = dr.zeros(mi.Color3f, camera.size[0] * camera.size[1])
     index = dr.compress(dr.detach(gbuffer.all.alpha) > COVERED)
     if dr.width(index) > 0:
         m = gbuffer.maps(index)
         mean = dr.rcp(m.alpha)
         normal, view = dr.normalize(m.normal), -pixel_directions(camera, index)
-        C_s = split_sum.specular(normal, view, m.roughness * mean, m.metallic * mean, m.base_color * mean, filtered, eta)
+        roughness = m.roughness * mean
+        C_s = split_sum.specular(normal, view, roughness, m.metallic * mean, m.base_color * mean, lighting.filtered,
+                                 lighting.eta)
+        if lighting.shader is not None:
+            C_s = lighting.shader(C_s, roughness, dr.dot(normal, view))
         dr.scatter(specular, C_s * m.alpha, index)
     return specular
 
 
-def render(surfels, camera, filtered, screen_offset=None, eta=split_sum.DEFAULT_ETA) -> Image:
-    """Splat and `shade`; differentiable in the surfels' fields and the environment."""
-    return shade(render_gbuffer(surfels, camera, screen_offset), camera, filtered, eta)
+def render(surfels, camera, lighting: Lighting | None, screen_offset=None) -> Image:
+    """Splat and `shade`; differentiable in the surfels' fields, the environment and the shader."""
+    return shade(render_gbuffer(surfels, camera, screen_offset), camera, lighting)

@@ -21,8 +21,8 @@ from scipy import fft
 from ..aligned import lanes
 from .tables import lobe
 
-#: Roughness of each level and the rows of its map; None: the environment's own. Level 0 is the mirror: no filter.
-LEVELS = ((0.0, None), (0.1, None), (0.2, None), (0.3, 64), (0.4, 64), (0.55, 32), (0.7, 32), (0.85, 16), (1.0, 16))
+#: Roughness of each level and the most rows of its map; None: as the environment. Level 0 is the mirror: no filter.
+LEVELS = ((0.0, None), (0.1, 128), (0.2, 128), (0.3, 64), (0.4, 64), (0.55, 32), (0.7, 32), (0.85, 16), (1.0, 16))
 _NEGLIGIBLE = 1e-5  # rows where the lobe is below this part of its peak are left out
 _NODES_PER_LOBE = 2  # quadrature nodes per GGX width α = roughness² of a lobe
 

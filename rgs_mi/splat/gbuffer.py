@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .composite import Layout, composite
-from .lists import tile_lists
+from .lists import lane_lists
 from .project import project
 from .tiles import Cutoffs
 
@@ -60,6 +60,6 @@ def render_gbuffer(surfels, camera, screen_offset=None, cutoffs=Cutoffs()) -> GB
     features = [*surfels.radiance(projected.view), *(projected.normal + delta), *surfels.column(mi.Color3f, "base_color"),
                 surfels.column(mi.Float, "roughness"), surfels.column(mi.Float, "metallic"), *delta]
     dr.eval(projected.geometry, features)
-    lists = tile_lists(projected, camera.size, cutoffs.alpha_min)
+    lists = lane_lists(projected, camera.size, cutoffs)
     image = composite(projected, features, lists, Layout(camera.size, len(features), cutoffs))
     return GBuffer(camera.size, image, lists.seen)

@@ -1,0 +1,93 @@
+"""A pixel meets a surfel: the weight and depth of its hit, their derivatives, and what surfels are sorted by."""
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+
+from .project import GEOMETRY
+from .tiles import LOW_PASS, PIXELS
+
+PACKET = 4  # floats per gather and scatter
+HORIZON = 1e-5  # least h of (1): beyond it a ray runs along the surfel's plane, or meets it behind the camera
+_HALF_DIAGONAL = 0.5 * math.hypot(PIXELS[0] - 1, PIXELS[1] - 1)  # from a lane's middle to its pixels' centres
+
+
+def pack(columns):
+    """Rows of PACKET-aligned floats, ``mi.Float``, from a list of ``mi.Float``."""
+    stride = -(-len(columns) // PACKET) * PACKET
+    columns = columns + [mi.Float(0)] * (stride - len(columns))
+    n = dr.width(columns)
+    out = dr.empty(mi.Float, n * stride)
+    row = dr.arange(mi.UInt32, n) * (stride // PACKET)
+    for q in range(stride // PACKET):
+        dr.scatter(out, mi.Vector4f(*columns[PACKET * q: PACKET * (q + 1)]), row + q)
+    return out
+
+
+def fetch(buffer, row, stride, active=True):
+    """The ``stride`` floats of row ``row``, as a list; zeros where not ``active``."""
+    floats = []
+    for q in range(stride // PACKET):
+        floats += list(dr.gather(mi.Vector4f, buffer, row * (stride // PACKET) + q, active))
+    return floats
+
+
+class Hit:
+    """One pixel against one record: equation (1) of `project.py` and the weight of (2) of `composite.py`."""
+
+    def __init__(self, record, x, y, cutoffs):
+        X, Y, A_x, A_y, B_x, B_y, N_x, N_y, z, opacity = record[:len(GEOMETRY)]
+        self.dx, self.dy = x - X, y - Y
+        h = 1 + N_x * self.dx + N_y * self.dy
+        in_front = h > HORIZON
+        self.inv_h = dr.rcp(dr.select(in_front, h, 1))
+        self.u = (A_x * self.dx + A_y * self.dy) * self.inv_h
+        self.v = (B_x * self.dx + B_y * self.dy) * self.inv_h
+        on_plane = dr.select(in_front, self.u * self.u + self.v * self.v, dr.largest(mi.Float))
+        on_screen = LOW_PASS * (self.dx * self.dx + self.dy * self.dy)
+        self.on_plane = on_plane <= on_screen  # else the low-pass decides, and the depth is the centre's
+        self.gauss = dr.exp(-0.5 * dr.minimum(on_plane, on_screen))
+        alpha = opacity * self.gauss
+        self.kept = alpha > cutoffs.alpha_min
+        self.clamped = alpha > cutoffs.alpha_max
+        self.alpha = dr.select(self.kept, dr.minimum(alpha, cutoffs.alpha_max), 0)
+        self.t = dr.select(self.on_plane, z * self.inv_h, z)
+
+    def sort_key(self, record, cutoffs):
+        """t, if this hit is in the middle of a lane's pixels, and −∞ where none of them can see the surfel."""
+        _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, opacity = record[:len(GEOMETRY)]
+        tilt = _HALF_DIAGONAL * dr.sqrt(N_x * N_x + N_y * N_y)
+        turn = _HALF_DIAGONAL * dr.sqrt(A_x * A_x + A_y * A_y + B_x * B_x + B_y * B_y)
+        # From the middle to a pixel, h changes by at most tilt, and (u, v) by (turn + |(u, v)| tilt) / h there
+        distance = dr.sqrt(self.u * self.u + self.v * self.v)
+        least_h = dr.rcp(self.inv_h) - tilt
+        on_plane = dr.select(least_h > HORIZON, distance - (turn + distance * tilt) / least_h, 0)
+        on_screen = math.sqrt(LOW_PASS) * (dr.sqrt(self.dx * self.dx + self.dy * self.dy) - _HALF_DIAGONAL)
+        nearest = dr.maximum(dr.minimum(on_plane, on_screen), 0)
+        return dr.select(opacity * dr.exp(-0.5 * nearest * nearest) > cutoffs.alpha_min, self.t, -dr.inf)
+
+    def pull_back(self, record, d_alpha, d_t):
+        """Gradient of the ten geometric numbers, from that of α and t."""
+        _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, _ = record[:len(GEOMETRY)]
+        d_alpha = dr.select(self.kept & ~self.clamped, d_alpha, 0)
+        d_rho = -0.5 * self.alpha * d_alpha
+        plane = lambda value: dr.select(self.on_plane, value, 0)
+        d_u, d_v = plane(2 * self.u * d_rho * self.inv_h), plane(2 * self.v * d_rho * self.inv_h)  # both over h
+        d_h = -(d_u * self.u + d_v * self.v) - plane(d_t * self.t * self.inv_h)
+        d_screen = dr.select(self.on_plane, 0, 2 * LOW_PASS * d_rho)
+        d_dx = d_u * A_x + d_v * B_x + d_h * N_x + d_screen * self.dx
+        d_dy = d_u * A_y + d_v * B_y + d_h * N_y + d_screen * self.dy
+        return [-d_dx, -d_dy, d_u * self.dx, d_u * self.dy, d_v * self.dx, d_v * self.dy, d_h * self.dx, d_h * self.dy,
+                dr.select(self.on_plane, d_t * self.inv_h, d_t), d_alpha * self.gauss]
+
+    def push_forward(self, record, tangent):
+        """(α̇, ṫ) from the tangent of the record."""
+        _, _, A_x, A_y, B_x, B_y, N_x, N_y, z, _ = record[:len(GEOMETRY)]
+        X_, Y_, A_x_, A_y_, B_x_, B_y_, N_x_, N_y_, z_, opacity_ = tangent[:len(GEOMETRY)]
+        h_ = N_x_ * self.dx + N_y_ * self.dy - N_x * X_ - N_y * Y_
+        u_ = (A_x_ * self.dx + A_y_ * self.dy - A_x * X_ - A_y * Y_ - self.u * h_) * self.inv_h
+        v_ = (B_x_ * self.dx + B_y_ * self.dy - B_x * X_ - B_y * Y_ - self.v * h_) * self.inv_h
+        rho_ = dr.select(self.on_plane, 2 * (self.u * u_ + self.v * v_), -2 * LOW_PASS * (self.dx * X_ + self.dy * Y_))
+        alpha_ = dr.select(self.kept & ~self.clamped, opacity_ * self.gauss - 0.5 * self.alpha * rho_, 0)
+        return alpha_, dr.select(self.on_plane, (z_ - self.t * h_) * self.inv_h, z_)
