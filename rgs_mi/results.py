@@ -32,7 +32,7 @@ def write(fit, scene, folder, quiet):
     background = fit.settings.background
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
-        exported = export(folder, scene, surfels, environment, fit.model.shader(), views)
+        exported = export(folder, scene, surfels, environment, fit.specular, fit.model.shader(), views)
         lighting = fit.lighting()
     scores, rows = {}, []
     on_sheet = {int(k) for k in np.linspace(0, len(views) - 1, SHEET_ROWS + 2)[1:-1].round()}

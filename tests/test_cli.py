@@ -84,6 +84,13 @@ def assert_renders_as_written(scene, run):
         assert abs(np.clip(shown, 0, 1) - written).max() < 1 / 255
 
 
+@pytest.mark.parametrize("preset", ["paper", "deferred2dgs", "sh2dgs", "mirror"])
+def test_presets(inputs, tmp_path, preset):
+    folder = fit(*inputs, tmp_path / "run", config=preset, overrides=[*SMALL, "iterations=3"])
+    assert (folder / "guided.png").exists() == (preset == "paper")
+    assert_renders_as_written(mi.load_file(str(folder / "scene.xml")), folder)
+
+
 @pytest.mark.parametrize("old, new", [
     ('type="rgs_deferred">', 'type="rgs_deferred"><string name="specular" value="none"/>'),
     ('<bsdf type="principled" id="material"/>', '<bsdf type="principled"><float name="eta" value="2.5"/></bsdf>')])
