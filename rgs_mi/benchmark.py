@@ -126,7 +126,7 @@ def step(path, data, count=15_000, steps=20, overrides=()):
         dr.kernel_history_clear()
         milliseconds = _milliseconds(fit.step, steps + 1)
         kernels = dr.kernel_history((dr.KernelType.JIT,))
-    compiled = sum(not k["cache_hit"] for k in kernels)
+    compiled = sum(not k["cache_hit"] or k["cache_disk"] for k in kernels)
     width, height = fit.dataset.train[0].camera.size
     print(f"{len(fit.model)} surfels, {width} x {height} pixels: {milliseconds:.1f} ms a step, "
           f"{len(kernels) / (steps + 1):.0f} kernels a step, {compiled} compiled after warm-up")

@@ -56,7 +56,16 @@ class Surfels:
 
     def column(self, kind, name):
         """Field ``name`` as a Dr.Jit array with one lane a surfel, e.g. ``column(mi.Point3f, "centers")``."""
-        return dr.unravel(kind, getattr(self, name).array)
+        tensor = getattr(self, name)
+        if kind is mi.Float:
+            return self._gather(tensor, 0)
+        return kind(*[self._gather(tensor, k) for k in range(tensor.shape[1])])
+
+    def _gather(self, tensor, k):
+        """Column ``k``. Each number is read once, so that the derivative needs no atomics, nor copies for each thread: these
+        would compile the number of surfels into the kernel."""
+        index = dr.arange(mi.UInt32, len(self)) * tensor.shape[1] + k
+        return dr.gather(mi.Float, tensor.array, index, mode=dr.ReduceMode.NoConflicts)
 
     def frames(self):
         """(t_u, t_v, n): unit tangents and normal of every surfel in world space, each ``mi.Vector3f`` of width N."""
@@ -68,12 +77,10 @@ class Surfels:
 
     def radiance(self, direction):
         """Diffuse radiance of every surfel seen along unit ``direction`` (from the camera), ``mi.Color3f`` of width N."""
-        stride = self.sh.shape[1]
-        index = dr.arange(mi.UInt32, len(self)) * stride
-        basis = dr.sh_eval(direction, sh_order(stride))
+        basis = dr.sh_eval(direction, sh_order(self.sh.shape[1]))
         value = mi.Color3f(0.5)
         for k, Y in enumerate(basis):
-            value += Y * mi.Color3f(*[dr.gather(mi.Float, self.sh.array, index + (3 * k + c)) for c in range(3)])
+            value += Y * mi.Color3f(*[self._gather(self.sh, 3 * k + c) for c in range(3)])
         return dr.maximum(value, 0)
 
 

@@ -172,7 +172,7 @@ def test_no_kernel_is_compiled_after_warm_up(dataset):
             fit.step()
         history = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
     assert len(history) > 100
-    assert [k["hash"] for k in history if not k["cache_hit"]] == []
+    assert [k["hash"] for k in history if not k["cache_hit"] or k["cache_disk"]] == []  # nor read from earlier sessions
 
 
 def test_resume_goes_on_where_it_stopped(dataset):

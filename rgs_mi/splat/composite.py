@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .hit import PACKET, Hit, fetch, pack
+from .hit import PACKET, Hit, fetch, pack, padded
 from .project import GEOMETRY
 from .tiles import Cutoffs, lane_pixels
 
@@ -37,11 +37,11 @@ class Layout:
 
     @property
     def record(self):
-        return -(-(len(GEOMETRY) + self.features) // PACKET) * PACKET
+        return padded(len(GEOMETRY) + self.features)
 
     @property
     def pixel(self):
-        return -(-(self.features + 2) // PACKET) * PACKET
+        return padded(self.features + 2)
 
 
 def _walk(lists, layout, state, body):

@@ -10,15 +10,22 @@ from .tiles import LOW_PASS, PIXELS
 
 PACKET = 4  # floats per gather and scatter
 HORIZON = 1e-5  # least h of (1): beyond it a ray runs along the surfel's plane, or meets it behind the camera
+_LEAST_ROWS = 1024
 _HALF_DIAGONAL = 0.5 * math.hypot(PIXELS[0] - 1, PIXELS[1] - 1)  # from a lane's middle to its pixels' centres
 
 
+def padded(count):
+    """Floats of a row that holds ``count``."""
+    return -(-count // PACKET) * PACKET
+
+
 def pack(columns):
-    """Rows of PACKET-aligned floats, ``mi.Float``, from a list of ``mi.Float``."""
-    stride = -(-len(columns) // PACKET) * PACKET
+    """Rows of PACKET-aligned floats, ``mi.Float``, from a list of ``mi.Float``, and room up to a power of two of rows: the
+    kernel that adds gradients into them (``ReduceMode.Expand``) has their number compiled in."""
+    stride = padded(len(columns))
     columns = columns + [mi.Float(0)] * (stride - len(columns))
     n = dr.width(columns)
-    out = dr.empty(mi.Float, n * stride)
+    out = dr.empty(mi.Float, max(_LEAST_ROWS, 1 << (n - 1).bit_length()) * stride)
     row = dr.arange(mi.UInt32, n) * (stride // PACKET)
     for q in range(stride // PACKET):
         dr.scatter(out, mi.Vector4f(*columns[PACKET * q: PACKET * (q + 1)]), row + q)

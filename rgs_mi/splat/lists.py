@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .hit import Hit, fetch, pack
+from .hit import Hit, fetch, pack, padded
 from .tiles import LOW_PASS, PIXELS, TILE, lane_pixels, tile_grid
 
 FAR = 1e6  # pixels: beyond every image
@@ -115,14 +115,13 @@ def lane_lists(projected, size, cutoffs) -> Lists:
         start = first * lanes + count * (dr.arange(mi.UInt32, dr.width(tile)) % lanes)  # room for the whole tile's list
         middle = [mi.Float(corner) + 0.5 * n for corner, n in zip(pixels[0], PIXELS)]
         records = pack(projected.geometry)
-        stride = dr.width(records) // dr.width(projected.visible)
         ids = dr.empty(mi.UInt32, dr.width(tiles.ids) * lanes)
         dr.eval(records, first, end, stop, start, middle)
 
         def step(i, at, depths, surfels):
             listed = i < end
             surfel = dr.gather(mi.UInt32, tiles.ids, i, listed)
-            record = fetch(records, surfel, stride, listed)
+            record = fetch(records, surfel, padded(len(projected.geometry)), listed)
             # One surfel enters the queue, the nearest leaves it; "farther than all" drives the rest out in the end.
             depth = dr.select(listed, Hit(record, *middle, cutoffs).sort_key(record, cutoffs), dr.inf)
             for k in reversed(range(cutoffs.window)):
