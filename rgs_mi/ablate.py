@@ -23,7 +23,7 @@ import numpy as np
 from . import checkpoint, results
 from .apart import apart
 from .comparison import DETAILS, FIGURES, mean_tables, means, picture, scene_table
-from .config import load_config, presets, to_dict
+from .config import completed, presets, to_dict
 from .errors import UserError
 from .run import optimize
 from .scene import FitScene
@@ -90,12 +90,16 @@ class Job:
     folder: Path
     asked: bool
 
+    def has(self, saved: dict) -> bool:
+        """Whether the settings ``saved`` with a fit are this job's."""
+        return completed(Settings, saved) == self.settings
+
     def figures(self) -> dict | None:
         """metrics.json of the finished fit; None where there is none, or one with other settings."""
         if not results.finished(self.folder):
             return None
         figures = json.loads((self.folder / results.METRICS).read_text())
-        return figures if same_settings(figures["settings"], self.settings) else None
+        return figures if self.has(figures["settings"]) else None
 
 
 def find_scenes(suite) -> dict[str, Path]:
@@ -135,24 +139,10 @@ def plan(suite, xml, *, scenes=None, variants=None, minutes=None, overrides=(), 
         variant = known[name]
         wanted = name in variants if variants else variant.scenes is None or k < variant.scenes
         changes = (*variant.overrides, *overrides, *budget, f"seed={seed}")
-        jobs.append(Job(scene, found[scene], name, seed, changes, _plain(template.settings(variant.preset, changes)),
+        jobs.append(Job(scene, found[scene], name, seed, changes, to_dict(template.settings(variant.preset, changes)),
                         Path(out) / scene / (f"{name}-{seed}" if seed else name),
                         asked=wanted and (not scenes or scene in scenes)))
     return jobs
-
-
-def _plain(settings) -> dict:
-    """Settings as they come back from JSON."""
-    return json.loads(json.dumps(to_dict(settings), default=str))
-
-
-def same_settings(saved: dict, settings: dict) -> bool:
-    """Whether the settings ``saved`` with a fit are ``settings``. A setting that is younger than the fit counts as its
-    default."""
-    def filled(tree, defaults):
-        return {k: filled(tree.get(k, {}), v) if isinstance(v, dict) and v else tree.get(k, v) for k, v in defaults.items()}
-
-    return filled(saved, _plain(load_config(Settings))) == settings
 
 
 # ---- Doing it ----
@@ -247,7 +237,7 @@ def _check_photographs(folder, digest):
 def _fit(xml, job, quiet):
     """Do a job, or go on with it."""
     saved = checkpoint.load_latest(job.folder)
-    resume = saved is not None and not results.finished(job.folder) and same_settings(saved[1]["settings"], job.settings)
+    resume = saved is not None and not results.finished(job.folder) and job.has(saved[1]["settings"])
     if saved and not resume:
         warnings.warn(f"{job.folder} had other settings: starting again", stacklevel=2)
         shutil.rmtree(job.folder / "checkpoints")

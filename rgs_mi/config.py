@@ -55,6 +55,15 @@ def to_dict(config) -> dict:
     return {f.name: _plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
 
 
+def completed(cls, tree: dict) -> dict:
+    """What `to_dict` once gave for a ``cls``, and JSON kept, as it would be now: settings that came later have their
+    defaults, those that are gone are left out."""
+    def fill(tree, defaults):
+        return {k: fill(tree.get(k, {}), v) if isinstance(v, dict) and v else tree.get(k, v) for k, v in defaults.items()}
+
+    return fill(tree, to_dict(cls()))
+
+
 def presets() -> list[str]:
     """Names of the presets that the package ships."""
     return sorted(p.name[:-5] for p in _preset_folder().iterdir() if p.name.endswith(".yaml"))

@@ -53,10 +53,9 @@ def photograph(view, background) -> np.ndarray:
 def score(view, rendering: Rendering, background) -> dict:
     """The `SCORES` of one view; ``normal_mae_deg`` is None where the view has no normals."""
     truth = photograph(view, background)
-    alpha = view.pixels[..., 3] / (255 if view.pixels.dtype == np.uint8 else 1)
     return {"psnr": metrics.psnr(rendering.image, truth), "ssim": metrics.ssim(rendering.image, truth),
             "normal_mae_deg": None if view.normal is None
-            else _finite(metrics.normal_mae_deg(rendering.maps["normal"], view.normal, alpha))}
+            else _finite(metrics.normal_mae_deg(rendering.maps["normal"], view.normal, view.alpha))}
 
 
 def mean_scores(scores: list[dict]) -> dict:

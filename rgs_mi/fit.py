@@ -136,22 +136,22 @@ class Fit:
         consistency = dr.opaque(mi.Float, self._scheduled(w.consistency))
         loss += consistency * losses.depth_normal_consistency(image.gbuffer, photo.camera)
         share = size[0] * size[1] / (photo.size[0] * photo.size[1])  # these are means over the whole photograph
-        loss = share * loss + self._regional(image.gbuffer, photo)
+        loss = share * loss + self._regional(i, image.gbuffer, photo)
         error = dr.mean(dr.mean(dr.square(dr.detach(rendered) - photo.color))) * share
         dr.backward(loss * weight)
         self.gradients.add(dr.grad(offset) / weight, image.gbuffer.seen, photo.size)
-        if self.settings.density.guided:
-            roughness, alpha = _mean_roughness(image.gbuffer)
-            self._reflective[i] = photo.camera, boxes(reflective_mask(roughness, alpha, self.settings.reflective))
         return error
 
-    def _regional(self, gbuffer, photo):
-        """RGS's losses that are normalised by regions of their own: L_normal and L_depth."""
+    def _regional(self, i, gbuffer, photo):
+        """RGS's losses of view ``i`` that are normalised by regions of their own, L_normal and L_depth; notes what is
+        reflective for density control."""
         w, maps, loss = self.settings.weights, gbuffer.all, mi.Float(0)
-        if w.normal > 0:
-            roughness, alpha = _mean_roughness(gbuffer)
-            roughest = np.quantile(roughness[alpha > 0.5], self.settings.reflective) if (alpha > 0.5).any() else 1.0
-            loss += w.normal * losses.normal_smoothness(gbuffer, dr.opaque(mi.Float, float(roughest)), w.crease)
+        if w.normal > 0 or self.settings.density.guided:
+            mask = self._reflective_mask(gbuffer)
+            if self.settings.density.guided:
+                self._reflective[i] = photo.camera, boxes(mask)
+            if w.normal > 0:
+                loss += w.normal * losses.normal_smoothness(gbuffer, mask, w.crease)
         if w.depth > 0 and photo.prior is not None:
             covered = maps.alpha > 0.5
             depth = maps.depth / dr.select(covered, maps.alpha, 1)
@@ -211,13 +211,12 @@ class Fit:
             image = deferred.render(self.model.surfels(self.sh_order), camera, self.lighting())
             shown = losses.display(image.color, image.gbuffer.all.alpha, self.settings.background)
         width, height = camera.size
-        mask = reflective_mask(*_mean_roughness(image.gbuffer), self.settings.reflective)
         shown = np.clip(shown.numpy().T.reshape(height, width, 3), 0, 1)
+        mask = self._reflective_mask(image.gbuffer)
         return picture(shown, mask, found, camera, self.model.numpy("centers")[flags])
 
-
-def _mean_roughness(gbuffer):
-    """(mean roughness, alpha), [H, W] each, as NumPy arrays."""
-    width, height = gbuffer.size
-    roughness, alpha = (dr.detach(v).numpy().reshape(height, width) for v in (gbuffer.all.roughness, gbuffer.all.alpha))
-    return roughness / np.maximum(alpha, 1e-6), alpha
+    def _reflective_mask(self, gbuffer):
+        """β̂ of a view, [H, W] bool."""
+        width, height = gbuffer.size
+        roughness, alpha = (dr.detach(v).numpy().reshape(height, width) for v in (gbuffer.all.roughness, gbuffer.all.alpha))
+        return reflective_mask(roughness / np.maximum(alpha, 1e-6), alpha, self.settings.reflective)

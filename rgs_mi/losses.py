@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .aligned import lanes
 from .shading.deferred import COVERED
 from .splat.project import opaque
 
@@ -122,21 +123,20 @@ def depth_normal_consistency(gbuffer, camera):
     return dr.sum(1 - dr.dot(n, n_depth)) / (width * height)
 
 
-def normal_smoothness(gbuffer, roughest, crease=0.0):
-    """RGS's L_normal: mean squared forward difference of N from pixel to pixel, over the pixels whose mean roughness is at
-    most ``roughest`` (an opaque ``mi.Float``), both of them. With ``crease``, d² counts as d² / (1 + d²/crease²): noise of
-    a few degrees is smoothed, an edge of the object is let be."""
+def normal_smoothness(gbuffer, reflective, crease=0.0):
+    """RGS's L_normal: mean squared forward difference of N from pixel to pixel, where both are ``reflective`` (β̂, [H, W]
+    bool, NumPy). With ``crease``, d² counts as d² / (1 + d²/crease²): noise of a few degrees is smoothed, an edge of the
+    object is let be."""
     width, height = gbuffer.size
     index = _interior(gbuffer)
     if dr.width(index) == 0:
         return mi.Float(0)
-    total, pairs = mi.Float(0), mi.Float(0)
-    here = gbuffer.maps(index)
-    smooth = lambda m: dr.detach(m.roughness) <= roughest * dr.detach(m.alpha)
+    total, pairs, here = mi.Float(0), mi.Float(0), gbuffer.maps(index).normal
+    mask = lanes(reflective)
+    inside = lambda i: dr.gather(mi.Float, mask, i) > 0
     for step in (1, width):
-        there = gbuffer.maps(index + step)
-        d2 = dr.squared_norm(there.normal - here.normal)
-        counted = smooth(here) & smooth(there)
+        d2 = dr.squared_norm(gbuffer.maps(index + step).normal - here)
+        counted = inside(index) & inside(index + step)
         total += dr.sum(dr.select(counted, d2 / (1 + d2 / crease**2) if crease > 0 else d2, 0))
         pairs += mi.Float(dr.count(counted))
     return 2 * total / dr.maximum(pairs, 1)

@@ -53,8 +53,7 @@ class Photographs:
     def _whole(self, i):
         """[H, W, 4 or 5] of this level: colour, coverage and, where there is one, the prior."""
         view = self.views[i]
-        alpha = view.pixels[..., 3:].astype(np.float32) / (255 if view.pixels.dtype == np.uint8 else 1)
-        whole = _shrink(np.concatenate([display(view.pixels, 0.0), alpha], 2), self.downscale)
+        whole = _shrink(np.concatenate([display(view.pixels, 0.0), view.alpha[..., None]], 2), self.downscale)
         if self.priors is None:
             return whole
         return np.concatenate([whole, resize(self.priors[i].values, *whole.shape[:2])[..., None]], 2)

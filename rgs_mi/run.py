@@ -1,6 +1,5 @@
 """A fit from beginning to end: photographs and scene in, a run's folder out. What `scripts/optimize.py` calls."""
 
-import json
 import shutil
 import sys
 import time
@@ -10,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from . import checkpoint, results
-from .config import to_dict
+from .config import completed, to_dict
 from .errors import UserError
 from .fit import Fit
 from .initial import initial_points
@@ -19,6 +18,7 @@ from .model import Model
 from .priors import depth_priors
 from .progress import Progress
 from .scene import FitScene
+from .settings import Settings
 
 _PRIORS = Path("data") / "priors"  # what is known of depths is kept here, below the current folder
 _SMOOTHING = 0.95  # of the PSNR that the progress line shows
@@ -89,7 +89,7 @@ def _resume(saved, scene, dataset, settings) -> Fit:
     arrays, meta = saved
     if meta["photographs"] != _photographs(dataset):
         raise UserError(f"{dataset.root}: not the photographs of the checkpoint: give its --data, or another --out")
-    old, new = {"shader": "identity"} | _flat(meta["settings"]), _flat(_plain(to_dict(settings)))
+    old, new = _flat(completed(Settings, meta["settings"])), _flat(to_dict(settings))
     changed = [key for key in new if old.get(key) != new[key]]
     if fixed := [key for key in ("sh_order", "shader") if key in changed]:
         raise UserError(f"{fixed[0]} is {old[fixed[0]]} in the checkpoint and can't change: choose another --out")
@@ -103,11 +103,6 @@ def _resume(saved, scene, dataset, settings) -> Fit:
 def _photographs(dataset) -> list:
     """What tells one data set from another: names and sizes of its training views."""
     return [[view.name, *map(int, view.camera.size)] for view in dataset.train]
-
-
-def _plain(value):
-    """``value`` as it comes back from JSON."""
-    return json.loads(json.dumps(value, default=str))
 
 
 def _flat(tree, prefix="") -> dict:

@@ -105,8 +105,7 @@ def _signed_distance(alpha: np.ndarray) -> np.ndarray:
 def _silhouettes(views) -> list[_Silhouette]:
     """The silhouettes of all masked views. Raises: UserError when fewer than two have a usable mask."""
     def one(view):
-        scale = np.float32(255) if view.pixels.dtype == np.uint8 else np.float32(1)
-        alpha = view.pixels[..., 3] / scale
+        alpha = view.alpha
         blank = (alpha > 0.5).all() or not (alpha > 0.5).any() or min(alpha.shape) < 2
         return None if blank else _Silhouette.of(alpha, view.camera)
 

@@ -24,8 +24,7 @@ class DepthPrior:
 
 def inside(view) -> np.ndarray:
     """[H, W] bool: the pixels of a `View` that its mask calls the object; all of them where it has none."""
-    alpha = view.pixels[..., 3]
-    return alpha > (127 if alpha.dtype == np.uint8 else 0.5)
+    return view.alpha > 0.5
 
 
 def outlined(values: np.ndarray, view) -> np.ndarray:

@@ -140,60 +140,59 @@ def lane_lists(projected, size, cutoffs) -> Lists:
 
 
 def _tile_lists(projected, size, alpha_min) -> Lists:
-    """The surfels of every tile, sorted by `_depth_at_tile`."""
-    with dr.suspend_grad():
-        columns, rows = tile_grid(size)
-        outline, drawn = _outline(projected.geometry, alpha_min)
-        drawn &= projected.visible
-        # A pixel belongs to the surfel when its centre does: tile row r holds the centres TILE[1] r + 1/2 …
-        index = lambda v, n, t: mi.Int32(dr.clip(dr.floor((v - 0.5) / t), -1, n))
-        top = dr.maximum(index(dr.minimum(outline.ey - outline.hy, outline.y - outline.r), rows, TILE[1]), 0)
-        bottom = dr.minimum(index(dr.maximum(outline.ey + outline.hy, outline.y + outline.r), rows, TILE[1]) + 1, rows)
-        drawn &= top < bottom
-        bottom = dr.select(drawn, bottom, top)
+    """The surfels of every tile, sorted by `_depth_at_tile`. Call it where gradients are suspended."""
+    columns, rows = tile_grid(size)
+    outline, drawn = _outline(projected.geometry, alpha_min)
+    drawn &= projected.visible
+    # A pixel belongs to the surfel when its centre does: tile row r holds the centres TILE[1] r + 1/2 …
+    index = lambda v, n, t: mi.Int32(dr.clip(dr.floor((v - 0.5) / t), -1, n))
+    top = dr.maximum(index(dr.minimum(outline.ey - outline.hy, outline.y - outline.r), rows, TILE[1]), 0)
+    bottom = dr.minimum(index(dr.maximum(outline.ey + outline.hy, outline.y + outline.r), rows, TILE[1]) + 1, rows)
+    drawn &= top < bottom
+    bottom = dr.select(drawn, bottom, top)
 
-        dr.eval(outline.columns(), top, bottom)
+    dr.eval(outline.columns(), top, bottom)
 
-        def span(row):
-            """First and one-past-last tile column of a tile row."""
-            low = mi.Float(row * TILE[1]) + 0.5
-            x_min, x_max = outline.span(low, low + (TILE[1] - 1))
-            first = mi.UInt32(dr.clip(dr.ceil((x_min - (TILE[0] - 0.5)) / TILE[0]), 0, columns))
-            last = mi.UInt32(dr.clip(dr.floor((x_max - 0.5) / TILE[0]) + 1, 0, columns))
-            return first, dr.maximum(last, first)
+    def span(row):
+        """First and one-past-last tile column of a tile row."""
+        low = mi.Float(row * TILE[1]) + 0.5
+        x_min, x_max = outline.span(low, low + (TILE[1] - 1))
+        first = mi.UInt32(dr.clip(dr.ceil((x_min - (TILE[0] - 0.5)) / TILE[0]), 0, columns))
+        last = mi.UInt32(dr.clip(dr.floor((x_max - 0.5) / TILE[0]) + 1, 0, columns))
+        return first, dr.maximum(last, first)
 
-        def count(row, n):
-            first, last = span(row)
-            return row + 1, n + (last - first)
+    def count(row, n):
+        first, last = span(row)
+        return row + 1, n + (last - first)
 
-        _, entries = dr.while_loop((mi.Int32(top), mi.UInt32(0)), lambda row, n: row < bottom, count)
-        offset = dr.prefix_reduce(dr.ReduceOp.Add, entries, exclusive=True)
-        total = int(offset[-1] + entries[-1]) if len(entries) else 0
-        n_tiles = columns * rows
-        seen = entries > 0
-        if total == 0:
-            return Lists(dr.zeros(mi.UInt32, 1), dr.zeros(mi.UInt32, n_tiles), dr.zeros(mi.UInt32, n_tiles), seen)
-        tile, surfel, depth = dr.empty(mi.UInt32, total), dr.empty(mi.UInt32, total), dr.empty(mi.Float, total)
-        number = dr.arange(mi.UInt32, dr.width(entries))
+    _, entries = dr.while_loop((mi.Int32(top), mi.UInt32(0)), lambda row, n: row < bottom, count)
+    offset = dr.prefix_reduce(dr.ReduceOp.Add, entries, exclusive=True)
+    total = int(offset[-1] + entries[-1]) if len(entries) else 0
+    n_tiles = columns * rows
+    seen = entries > 0
+    if total == 0:
+        return Lists(dr.zeros(mi.UInt32, 1), dr.zeros(mi.UInt32, n_tiles), dr.zeros(mi.UInt32, n_tiles), seen)
+    tile, surfel, depth = dr.empty(mi.UInt32, total), dr.empty(mi.UInt32, total), dr.empty(mi.Float, total)
+    number = dr.arange(mi.UInt32, dr.width(entries))
 
-        def place(row, at):
-            first, last = span(row)
+    def place(row, at):
+        first, last = span(row)
 
-            def put(column, at):
-                dr.scatter(tile, mi.UInt32(row) * columns + column, at)
-                dr.scatter(surfel, number, at)
-                dr.scatter(depth, _depth_at_tile(projected.geometry, column, row), at)
-                return column + 1, at + 1
+        def put(column, at):
+            dr.scatter(tile, mi.UInt32(row) * columns + column, at)
+            dr.scatter(surfel, number, at)
+            dr.scatter(depth, _depth_at_tile(projected.geometry, column, row), at)
+            return column + 1, at + 1
 
-            _, at = dr.while_loop((first, at), lambda column, at: column < last, put)
-            return row + 1, at
+        _, at = dr.while_loop((first, at), lambda column, at: column < last, put)
+        return row + 1, at
 
-        dr.eval(dr.while_loop((mi.Int32(top), mi.UInt32(offset)), lambda row, at: row < bottom, place))
-        length = dr.zeros(mi.UInt32, n_tiles)
-        dr.scatter_reduce(dr.ReduceOp.Add, length, mi.UInt32(1), tile)
-        first = dr.prefix_reduce(dr.ReduceOp.Add, length, exclusive=True)
-        near = dr.argsort(depth)
-        order = dr.gather(mi.UInt32, near, dr.argsort(dr.gather(mi.UInt32, tile, near)))  # stable: by tile, then by depth
-        ids = dr.gather(mi.UInt32, surfel, order)
-        dr.eval(ids, first, length, seen)
-        return Lists(ids, first, length, seen)
+    dr.eval(dr.while_loop((mi.Int32(top), mi.UInt32(offset)), lambda row, at: row < bottom, place))
+    length = dr.zeros(mi.UInt32, n_tiles)
+    dr.scatter_reduce(dr.ReduceOp.Add, length, mi.UInt32(1), tile)
+    first = dr.prefix_reduce(dr.ReduceOp.Add, length, exclusive=True)
+    near = dr.argsort(depth)
+    order = dr.gather(mi.UInt32, near, dr.argsort(dr.gather(mi.UInt32, tile, near)))  # stable: by tile, then by depth
+    ids = dr.gather(mi.UInt32, surfel, order)
+    dr.eval(ids, first, length, seen)
+    return Lists(ids, first, length, seen)

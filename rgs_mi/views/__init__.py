@@ -30,6 +30,12 @@ class View:
     normal: np.ndarray | None
     path: Path
 
+    @property
+    def alpha(self) -> np.ndarray:
+        """[H, W] float32 coverage in [0, 1]."""
+        alpha = self.pixels[..., 3]
+        return alpha / np.float32(255) if alpha.dtype == np.uint8 else alpha
+
 
 @dataclass(frozen=True)
 class Dataset:
