@@ -12,6 +12,11 @@ what a principled BSDF with the G-buffer's material reflects of the environment 
    - ``split_sum``: the environment filtered by roughness times the directional albedo; ``none``: diffuse radiance only
      (Default: ``split_sum``)
 
+ * - indirect
+   - |string|
+   - What a reflected ray that meets a surfel brings: ``none``, the environment behind it; ``visibility``, nothing;
+     ``one_bounce``, the surfel's own radiance, which in turn reflects the environment alone (Default: ``none``)
+
  * - shader
    - |string|
    - What a pixel makes of the specular radiance: the weights of a tiny network, an ``.npz`` that a fit with
@@ -48,7 +53,8 @@ import mitsuba as mi
 
 from rgs_mi.camera import Camera
 from rgs_mi.errors import UserError
-from rgs_mi.shading import deferred, prefilter
+from rgs_mi.proxies import Proxies
+from rgs_mi.shading import deferred, indirect, prefilter
 from rgs_mi.shading.environment import Environment, FilteredEnvironment
 from rgs_mi.shading.shader import Shader
 from rgs_mi.splat.gbuffer import render_gbuffer
@@ -69,6 +75,9 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         self.specular = props.get("specular", "split_sum")
         if self.specular not in ESTIMATORS:
             raise UserError(f"rgs_deferred: unknown specular '{self.specular}': choose one of {', '.join(ESTIMATORS)}")
+        self.indirect = props.get("indirect", "none")
+        if self.indirect not in indirect.KINDS:
+            raise UserError(f"rgs_deferred: unknown indirect '{self.indirect}': choose one of {', '.join(indirect.KINDS)}")
         self.shader_file = resolve(props.get("shader", ""))
         self.shader = Shader.load(self.shader_file) if self.shader_file else None
         self.aovs = [name.strip() for name in props.get("aovs", "").split(",") if name.strip()]
@@ -118,8 +127,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         filtered = self._filtered_environment(scene)
         gbuffer = render_gbuffer(surfels, camera)
         maps = gbuffer.all
-        lighting = None if self.specular == "none" else deferred.Lighting(filtered, eta, self.shader)
-        image = deferred.shade(gbuffer, camera, lighting)
+        image = deferred.shade(gbuffer, camera, self._lighting(surfels, eta, filtered))
         rays = deferred.pixel_directions(camera, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]))
         color, alpha = image.color, maps.alpha
         if not self.hide_emitters and filtered is not None:
@@ -128,6 +136,14 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         for name in self.aovs:
             values += _aov(name, image, maps, camera, rays)
         return _average(values, width, height, samples)
+
+    def _lighting(self, surfels, eta, filtered):
+        if self.specular == "none":
+            return None
+        each_other = None
+        if self.indirect != "none":
+            each_other = indirect.Indirect(self.indirect, Proxies(surfels), surfels)
+        return deferred.Lighting(filtered, eta, self.shader, each_other)
 
     def _filtered_environment(self, scene):
         """The scene's environment, filtered as the estimator needs it; kept until texels change."""

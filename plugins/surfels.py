@@ -44,13 +44,12 @@ import mitsuba as mi
 
 from rgs_mi.errors import UserError
 from rgs_mi.ply import read_ply
+from rgs_mi.proxies import corners, quads
 from rgs_mi.shading.split_sum import DEFAULT_ETA
 from rgs_mi.surfel import CHANNELS, Surfels
 
 EXTENT = 3.0  # half the width of a proxy, in standard deviations
 GEOMETRY = ("centers", "rotations", "scales")
-CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
-TRIANGLES = (0, 1, 2, 0, 2, 3)
 
 
 class _MeshBuffers(mi.TraversalCallback):
@@ -115,9 +114,9 @@ class SurfelShape(mi.Mesh):
             if len(self.surfels) == 0:
                 positions, faces = dr.zeros(mi.Float, 9), mi.UInt32(0, 1, 2)
             elif self.proxies:
-                positions, faces = _quads(_corners(self.surfels))
+                positions, faces = quads(corners(self.surfels, EXTENT))
             else:
-                positions, faces = _diagonal(_corners(self.surfels)), mi.UInt32(0, 1, 2)
+                positions, faces = _diagonal(corners(self.surfels, EXTENT)), mi.UInt32(0, 1, 2)
             dr.eval(positions, faces)
             mi.Mesh.traverse(self, _MeshBuffers({"vertex_positions": positions, "faces": faces}))
         mi.Mesh.parameters_changed(self, ["vertex_positions", "faces"])
@@ -149,25 +148,6 @@ def _eta(shape, props):
     if "eta" in params:
         return round(params["eta"][0], 6)
     return round(2 / (1 - (0.08 * params["specular"][0]) ** 0.5) - 1, 6)
-
-
-def _corners(surfels):
-    """Corners of every surfel's quad, four ``mi.Point3f`` of width N."""
-    t_u, t_v, _ = surfels.frames()
-    center, scale = surfels.column(mi.Point3f, "centers"), EXTENT * surfels.column(mi.Vector2f, "scales")
-    return [center + i * scale.x * t_u + j * scale.y * t_v for i, j in CORNERS]
-
-
-def _quads(corners):
-    """(positions, faces) of two triangles a surfel."""
-    n = dr.width(corners)
-    i = dr.arange(mi.UInt32, n)
-    positions, faces = dr.empty(mi.Float, 12 * n), dr.empty(mi.UInt32, 6 * n)
-    for k, corner in enumerate(corners):
-        dr.scatter(positions, corner, 4 * i + k)
-    for k, vertex in enumerate(TRIANGLES):
-        dr.scatter(faces, 4 * i + vertex, 6 * i + k)
-    return positions, faces
 
 
 def _diagonal(corners):

@@ -18,8 +18,6 @@ import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from . import checkpoint, results
 from .apart import apart
 from .comparison import DETAILS, FIGURES, mean_tables, means, picture, scene_table
@@ -43,8 +41,10 @@ class Variant:
     scenes: int | None = None
 
 
-#: Cross-view shape consistency regularisation; in the paper's loss it stands in the place of 2DGS's own consistency.
-CSCR = ("weights.depth=1e-3", "weights.normal=1e-2", "weights.crease=0", "weights.delta_normal=1e-3",
+#: Cross-view shape consistency regularisation; in the paper's loss it stands in the place of 2DGS's own consistency. The
+#: shape that views agree on is the visual hull's here, and surfels start on it.
+HULL = ("start.hull=true", "rates.rotations=[2e-3,2e-4]")
+CSCR = (*HULL, "weights.depth=1e-3", "weights.normal=1e-2", "weights.crease=0", "weights.delta_normal=1e-3",
         "weights.consistency=[0,0]", "rates.delta_normal=[1e-3,1e-4]", "prior.name=hull")
 #: Reflection-guided densification.
 RD = ("density.guided=true",)
@@ -52,6 +52,7 @@ RD = ("density.guided=true",)
 VARIANTS = {
     "sh2dgs": Variant("2DGS, not deferred", "sh2dgs"),
     "baseline": Variant("deferred 2DGS", "deferred2dgs"),
+    "hull": Variant("+ start on the hull", "deferred2dgs", HULL),
     "cscr": Variant("+ CSCR", "deferred2dgs", CSCR),
     "rd": Variant("+ RD", "deferred2dgs", RD),
     "full": Variant("full: + CSCR + RD", "paper"),  # the preset is that sum, as a test makes sure
@@ -59,6 +60,7 @@ VARIANTS = {
     "no-depth": Variant("full, no depth prior", "paper", ("weights.depth=0",), "full", 2),
     "no-normal": Variant("full, no L_normal", "paper", ("weights.normal=0",), "full", 2),
     "no-delta-normal": Variant("full, no Δn", "paper", ("weights.delta_normal=0", "rates.delta_normal=[0,0]"), "full", 2),
+    "no-indirect": Variant("fast, reflections of the light alone", "fast", ("indirect=none",), "fast", 2),
     "no-guided": Variant("full, no RD", "paper", ("density.guided=false",), "full", 2),
 }
 
@@ -71,7 +73,6 @@ PAPER = {
 }
 
 _DIGEST = "photographs.sha256"  # in a scene's folder: what its fits are of
-_VIEWS = 2  # in a scene's picture
 
 
 # ---- What there is to do ----
@@ -221,8 +222,7 @@ def _photographs(xml, data, quiet):
     for view in [*dataset.train, *dataset.test]:
         for part in (view.name.encode(), view.camera.to_world.tobytes(), view.pixels.tobytes()):
             digest.update(part)
-    views = (dataset.test or dataset.train)[:results.GBUFFERS]
-    return digest.hexdigest(), [views[k] for k in sorted({round(k) for k in np.linspace(0, len(views) - 1, _VIEWS)})]
+    return digest.hexdigest(), results.shown(dataset.test or dataset.train[:results.SHOWN])[::2]
 
 
 def _check_photographs(folder, digest):

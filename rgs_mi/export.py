@@ -25,13 +25,13 @@ def write_exr(path, pixels: np.ndarray, channels=None):
         stream.write(memory.raw_buffer())
 
 
-def export(folder, scene, surfels, environment, specular, shader, views) -> list[Path]:
+def export(folder, scene, surfels, environment, specular, indirect, shader, views) -> list[Path]:
     """Write ``object.ply``, ``environment.exr``, ``shader.npz`` (where ``shader`` is not None, the identity) and
     ``scene.xml`` into ``folder`` and return their paths.
 
     The scene is the one that was fitted (a `FitScene`) with the results in place of where the fit started, the estimator
-    ``specular``, and a sensor for each of ``views``, whose id is the view's name: ``mi.render(mi.load_file("scene.xml"),
-    sensor=i)``.
+    ``specular``, ``indirect`` light, and a sensor for each of ``views``, whose id is the view's name:
+    ``mi.render(mi.load_file("scene.xml"), sensor=i)``.
     Raises: UserError where the disk is full or the folder can't be written.
     """
     folder = Path(folder)
@@ -39,7 +39,8 @@ def export(folder, scene, surfels, environment, specular, shader, views) -> list
     write_exr(folder / ENVIRONMENT, environment.texels.numpy())
     if shader:
         shader.save(folder / SHADER)
-    root = _fitted(scene, surfels, environment, specular, shader)
+    root = _fitted(scene, surfels, environment, {"specular": specular, "indirect": indirect,
+                                                   "shader": SHADER if shader else None})
     if any(abs(v.camera.focal[0] / v.camera.focal[1] - 1) > 1e-4 for v in views):
         warnings.warn(f"{folder / SCENE}: the cameras' pixels are not square, those of its sensors are", stacklevel=2)
     root.extend(_sensor(view) for view in views)
@@ -54,8 +55,9 @@ def sensor_id(name: str) -> str:
     return name.replace(".", "_")
 
 
-def _fitted(scene, surfels, environment, specular, shader):
-    """The scene's XML with results in place of photographs and of the starting light, and without sensors."""
+def _fitted(scene, surfels, environment, properties):
+    """The scene's XML with results in place of photographs and of the starting light, with ``properties`` of the integrator
+    (None: its default), and without sensors."""
     root = copy.deepcopy(scene.root)
     for sensor in root.findall("sensor"):
         root.remove(sensor)
@@ -67,7 +69,7 @@ def _fitted(scene, surfels, environment, specular, shader):
     emitter[:] = [_element("string", "filename", ENVIRONMENT), _transform(environment.rotation)]
     emitter.set("type", "envmap")
     integrator = scene.integrator_element(root)
-    for name, value in {"specular": specular, "shader": SHADER if shader else None}.items():
+    for name, value in properties.items():
         for element in integrator.findall(f"*[@name='{name}']"):
             integrator.remove(element)
         if value:

@@ -12,7 +12,9 @@ from .density import Gradients, densify
 from .guided import boxes, guided, picture, reflective_mask
 from .model import ENVIRONMENT, SHADER, Model
 from .photographs import Photographs
+from .proxies import Proxies
 from .shading import deferred
+from .shading.indirect import Indirect
 from .shading.split_sum import DEFAULT_ETA
 from .surfel import CHANNELS, Surfels
 
@@ -20,6 +22,7 @@ from .surfel import CHANNELS, Surfels
 _RATES = {"centers": "centers", "rotations": "rotations", "log_scales": "scales", "logit_opacities": "opacities",
           "sh_dc": "sh_dc", "sh_rest": "sh_rest", "logit_base_color": "base_color", "logit_roughness": "roughness",
           "logit_metallic": "metallic", "delta_normal": "delta_normal", ENVIRONMENT: "environment", SHADER: "shader"}
+_REBUILD = 50  # steps from one tree of what reflected rays meet to the next
 _DIVERGED = 10  # steps in a row without a finite error
 
 
@@ -38,6 +41,7 @@ class Fit:
         self.step_number, self.views_used, self.elapsed = 0, 0, 0.0
         self.gradients = Gradients(len(model))
         self.photographs = None
+        self.proxies = None  # what reflected rays meet
         self._reflective = {}  # (camera, boxes) of what was reflective when a view was last seen
         self.psnr, self.failures = 0.0, 0
 
@@ -75,11 +79,18 @@ class Fit:
             return 0
         return min(s.sh_order, 1 + int((self.progress - s.sh_start) / (1 - s.sh_start + 1e-9) * s.sh_order))
 
-    def lighting(self) -> deferred.Lighting | None:
-        """How the model is shaded: None where nothing specular is, or not yet."""
+    @property
+    def _sees_itself(self):
+        """Whether the object is reflected in itself by now."""
+        return self.settings.indirect != "none" and self.progress >= self.settings.indirect_start
+
+    def lighting(self, surfels, proxies=None) -> deferred.Lighting | None:
+        """How the model's ``surfels`` are shaded: None where nothing specular is, or not yet. ``proxies``: what reflected
+        rays meet (None: the surfels as they are)."""
         if self.specular == "none" or self.progress < self.settings.specular_start:
             return None
-        return deferred.Lighting(self.model.environment().filtered(), self.eta, self.model.shader())
+        indirect = self._sees_itself and Indirect(self.settings.indirect, proxies or Proxies(surfels), surfels)
+        return deferred.Lighting(self.model.environment().filtered(), self.eta, self.model.shader(), indirect or None)
 
     def step(self):
         """One step of the optimiser on the next few views, and density control when it is due."""
@@ -89,15 +100,17 @@ class Fit:
             self.photographs = Photographs(self.dataset.train, stage.downscale, s.background, self.priors)
         self._set_rates()
         views = self._next_views(stage.views)
-        lighting = self.lighting()
         surfels = self.model.surfels(self.sh_order)
+        if self.proxies is None or self.step_number % _REBUILD == 0:
+            self.proxies = Proxies(surfels) if self._sees_itself else None
+        lighting = self.lighting(surfels, self.proxies)
         # The views share what lies before them: their gradients meet in leaves there, and go the rest of the way once.
         shared = [*(getattr(surfels, name) for name in CHANNELS), *(lighting.learned() if lighting else [])]
         leaves = [type(v)(dr.detach(v)) for v in shared]
         dr.eval(leaves)
         dr.enable_grad(leaves)
         surfels = Surfels(*leaves[:len(CHANNELS)], surfels.two_sided)
-        lighting = lighting and lighting.with_learned(leaves[len(CHANNELS):])
+        lighting = lighting and lighting.with_learned(leaves[len(CHANNELS):], surfels)
         errors = [self._view(i, surfels, lighting, 1 / len(views)) for i in views]
         for value, leaf in zip(shared, leaves):
             gradient = dr.grad(leaf)
@@ -192,6 +205,7 @@ class Fit:
             budget = int(self.settings.start.surfels + opened * (d.max_surfels - self.settings.start.surfels))
             rng = np.random.default_rng((self.settings.seed, self.step_number))
             densify(self.model, self.gradients, self.extent, d, rng, budget, self._guided())
+            self.proxies = None
         self.gradients = Gradients(len(self.model))
 
     def _guided(self):
@@ -208,7 +222,8 @@ class Fit:
             return None
         camera, found = next(reversed(self._reflective.values()))
         with dr.suspend_grad():
-            image = deferred.render(self.model.surfels(self.sh_order), camera, self.lighting())
+            surfels = self.model.surfels(self.sh_order)
+            image = deferred.render(surfels, camera, self.lighting(surfels))
             shown = losses.display(image.color, image.gbuffer.all.alpha, self.settings.background)
         width, height = camera.size
         shown = np.clip(shown.numpy().T.reshape(height, width, 3), 0, 1)

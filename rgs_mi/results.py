@@ -17,7 +17,7 @@ from .export import export
 from .progress import Progress
 
 METRICS, SHEET, GUIDED = "metrics.json", "contact_sheet.png", "guided.png"
-SHEET_ROWS, GBUFFERS = 4, 4  # test views on the sheet, and with their G-buffers written
+SHOWN = 4  # test views on the sheet, and with their G-buffers written
 _NO_LPIPS = "not measured: this version has no LPIPS weights"
 
 
@@ -28,20 +28,21 @@ def write(fit, scene, folder, quiet):
     Raises: UserError where the disk is full or the folder can't be written.
     """
     held_out = bool(fit.dataset.test)
-    views = fit.dataset.test or fit.dataset.train[:SHEET_ROWS]
+    views = fit.dataset.test or fit.dataset.train[:SHOWN]
     background = fit.settings.background
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
-        exported = export(folder, scene, surfels, environment, fit.specular, fit.model.shader(), views)
-        lighting = fit.lighting()
+        exported = export(folder, scene, surfels, environment, fit.specular, fit.settings.indirect,
+                          fit.model.shader(), views)
+        lighting = fit.lighting(surfels)
     scores, rows = {}, []
-    on_sheet = {int(k) for k in np.linspace(0, len(views) - 1, SHEET_ROWS + 2)[1:-1].round()}
+    on_sheet = {view.name for view in shown(views)}
     with Progress(None, quiet, "evaluating") as progress:
         for k, view in enumerate(views):
             rendering = evaluate.render_view(surfels, lighting, view.camera, background)
-            pictures.write_view(folder / "test", view, rendering, background, gbuffer=k < GBUFFERS)
+            pictures.write_view(folder / "test", view, rendering, background, gbuffer=view.name in on_sheet)
             scores[view.name] = evaluate.score(view, rendering, background)
-            if k in on_sheet:
+            if view.name in on_sheet:
                 rows.append((view, rendering))
             progress.update((k + 1) / len(views))
     if (guided := fit.guided_picture()) is not None:
@@ -54,6 +55,11 @@ def write(fit, scene, folder, quiet):
     lines = _summary(figures)
     pictures.contact_sheet(folder / SHEET, rows, environment.texels.numpy(), background, folder.resolve().name, lines)
     print("\n".join([*lines, "", *map(str, (folder / SHEET, folder / METRICS, *exported, folder / "test"))]))
+
+
+def shown(views) -> list:
+    """The views of a list that pictures show: `SHOWN` of them, evenly spread."""
+    return [views[k] for k in sorted({int(k) for k in np.linspace(0, len(views) - 1, SHOWN + 2)[1:-1].round()})]
 
 
 def finished(folder) -> bool:

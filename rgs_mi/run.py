@@ -69,7 +69,8 @@ def _saved(folder, resume):
 
 def start(scene, dataset, settings) -> Fit:
     """A fit at its beginning."""
-    positions, normals, colors, spacing = initial_points(dataset, settings.start.surfels, settings.seed)
+    positions, normals, colors, spacing = initial_points(dataset, settings.start.surfels, settings.seed,
+                                                         settings.start.hull)
     extent = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
     light = scene.environment
     model = Model.start(positions, normals, colors, spacing, light.texels.numpy(), light.rotation, settings.sh_order,

@@ -22,6 +22,7 @@ class Start:
     """Where the fit begins."""
 
     surfels: int = _within(25_000, 1, 10_000_000)
+    hull: bool = True  # on the visual hull, where photographs have masks; else on the data set's points, or at random
     scale: float = _within(0.8, 0.01, 10)  # standard deviation over the distance to the neighbours
     roughness: float = _within(0.3, 0, 1)
 
@@ -31,7 +32,7 @@ class Rates:
     """Adam's learning rates: the first and the last, joined geometrically. Positions are in units of the object."""
 
     centers: tuple[float, float] = (5e-4, 1e-5)
-    rotations: tuple[float, float] = (5e-3, 5e-4)
+    rotations: tuple[float, float] = (2e-3, 2e-4)
     scales: tuple[float, float] = (1e-2, 2e-3)
     opacities: tuple[float, float] = (5e-2, 1e-2)
     sh_dc: tuple[float, float] = (1e-2, 1e-3)
@@ -91,6 +92,8 @@ class Settings:
     specular_start: float = _within(0.0, 0, 1)  # fraction of the fit from which reflections are shaded; 1: never
     reflective: float = _within(0.9, 0, 1)  # the fraction of a view's foreground, smoothest first, that is reflective
     shader: Literal["identity", "mlp"] = "identity"  # f_φ of C = C_d + f_φ(C_s): nothing, or a tiny network trained along
+    indirect: Literal["none", "visibility", "one_bounce"] = "one_bounce"  # what reflected rays that meet surfels bring
+    indirect_start: float = _within(0.1, 0, 1)  # fraction of the fit from which they are traced
     sh_order: int = _within(2, 0, 3)
     sh_start: float = _within(0.4, 0, 1)  # fraction of the fit from which view-dependent diffuse is learned
     checkpoint_seconds: float = _within(20, 0, 1e6)

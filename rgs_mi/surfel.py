@@ -67,6 +67,16 @@ class Surfels:
         index = dr.arange(mi.UInt32, len(self)) * tensor.shape[1] + k
         return dr.gather(mi.Float, tensor.array, index, mode=dr.ReduceMode.NoConflicts)
 
+    def take(self, number) -> "Surfels":
+        """The surfels ``number`` (``mi.UInt32``, repeats allowed)."""
+        def rows(tensor):
+            count, channels = dr.width(number), tensor.shape[1]
+            lane = dr.arange(mi.UInt32, count * channels)
+            index = dr.gather(mi.UInt32, number, lane // channels) * channels + lane % channels
+            return mi.TensorXf(dr.gather(mi.Float, tensor.array, index, mode=dr.ReduceMode.Local), (count, channels))
+
+        return Surfels(*(rows(getattr(self, name)) for name in CHANNELS), self.two_sided)
+
     def frames(self):
         """(t_u, t_v, n): unit tangents and normal of every surfel in world space, each ``mi.Vector3f`` of width N."""
         x, y, z, w = dr.normalize(self.column(mi.Vector4f, "rotations"))

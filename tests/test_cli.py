@@ -91,6 +91,13 @@ def test_presets(inputs, tmp_path, preset):
     assert_renders_as_written(mi.load_file(str(folder / "scene.xml")), folder)
 
 
+def test_indirect_light_is_exported(inputs, tmp_path):
+    folder = fit(*inputs, tmp_path / "run", overrides=[*SMALL, "indirect=one_bounce", "indirect_start=0"])
+    scene = mi.load_file(str(folder / "scene.xml"))
+    assert scene.integrator().indirect == "one_bounce"
+    assert_renders_as_written(scene, folder)
+
+
 @pytest.mark.parametrize("old, new", [
     ('type="rgs_deferred">', 'type="rgs_deferred"><string name="specular" value="none"/>'),
     ('<bsdf type="principled" id="material"/>', '<bsdf type="principled"><float name="eta" value="2.5"/></bsdf>')])

@@ -162,6 +162,7 @@ def test_bad_shapes(shape, message):
 
 @pytest.mark.parametrize("integrator, message", [
     ({"specula": "none"}, "specula"), ({"specular": "nothing"}, "unknown specular 'nothing'"),
+    ({"indirect": "two"}, "unknown indirect 'two'"),
     ({"aovs": "depth,colour"}, "unknown aov 'colour'"),
 ])
 def test_bad_integrators(integrator, message):

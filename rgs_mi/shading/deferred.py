@@ -9,6 +9,7 @@ from ..splat.gbuffer import render_gbuffer
 from ..splat.project import opaque
 from . import split_sum
 from .environment import FilteredEnvironment
+from .indirect import Indirect
 from .shader import Shader
 
 COVERED = 4e-3  # pixels with less alpha are left empty
@@ -16,19 +17,36 @@ COVERED = 4e-3  # pixels with less alpha are left empty
 
 @dataclass
 class Lighting:
-    """What surfels reflect, and how: the environment, their index of refraction, and f_φ (None: the identity)."""
+    """What surfels reflect, and how: the environment, their index of refraction, f_φ (None: the identity), and each other
+    (None: not)."""
 
     filtered: FilteredEnvironment
     eta: float = split_sum.DEFAULT_ETA
     shader: Shader | None = None
+    indirect: Indirect | None = None
+
+    def specular(self, normal, view, roughness, metallic, base_color, point=None):
+        """f_φ(C_s), radiance that surfaces reflect towards ``view``, ``mi.Color3f``, by split sum.
+
+        ``normal``, ``view``: unit, world space, ``view`` from the surface to the camera. ``point``: where the surfaces are
+        (None: they reflect the environment alone).
+        """
+        cosine = dr.dot(normal, view)
+        reflected = 2 * cosine * normal - view
+        incoming = self.filtered.eval(reflected, roughness)
+        if point is not None and self.indirect is not None:
+            incoming = self.indirect.cover(incoming, point, normal, reflected, self)
+        C_s = incoming * split_sum.albedo(cosine, roughness, metallic, base_color, self.eta)
+        return C_s if self.shader is None else self.shader(C_s, roughness, cosine)
 
     def learned(self) -> list:
         """The arrays that a fit changes: filtered texels, and the weights of the shader where there is one."""
         return [self.filtered.texels, *([self.shader.weights] if self.shader else [])]
 
-    def with_learned(self, arrays) -> "Lighting":
-        """The same with other ``arrays`` in place of `learned`."""
-        return replace(self, filtered=replace(self.filtered, texels=arrays[0]), shader=self.shader and Shader(arrays[1]))
+    def with_learned(self, arrays, surfels) -> "Lighting":
+        """The same with other ``arrays`` in place of `learned`, and for other ``surfels``, moved ones."""
+        return replace(self, filtered=replace(self.filtered, texels=arrays[0]), shader=self.shader and Shader(arrays[1]),
+                       indirect=self.indirect and replace(self.indirect, surfels=surfels))
 
 
 @dataclass
@@ -67,12 +85,10 @@ def _specular(gbuffer, camera, lighting):
     if dr.width(index) > 0:
         m = gbuffer.maps(index)
         mean = dr.rcp(m.alpha)
-        normal, view = dr.normalize(m.normal), -pixel_directions(camera, index)
-        roughness = m.roughness * mean
-        C_s = split_sum.specular(normal, view, roughness, m.metallic * mean, m.base_color * mean, lighting.filtered,
-                                 lighting.eta)
-        if lighting.shader is not None:
-            C_s = lighting.shader(C_s, roughness, dr.dot(normal, view))
+        normal, direction = dr.normalize(m.normal), pixel_directions(camera, index)
+        rotation, origin, *_ = opaque(camera)
+        point = origin + direction * (m.depth * mean / (rotation @ direction).z)
+        C_s = lighting.specular(normal, -direction, m.roughness * mean, m.metallic * mean, m.base_color * mean, point)
         dr.scatter(specular, C_s * m.alpha, index)
     return specular
 

@@ -30,12 +30,3 @@ def albedo(cosine, roughness, metallic, base_color, eta=DEFAULT_ETA):
     dielectric, black, white = value
     return (1 - metallic) * dielectric + metallic * (base_color * (white - black) + black)
 
-
-def specular(normal, view, roughness, metallic, base_color, filtered, eta=DEFAULT_ETA):
-    """Specular radiance C_s towards the camera, ``mi.Color3f``.
-
-    ``normal``, ``view``: unit, world space, ``view`` from the surface to the camera. ``filtered``: `FilteredEnvironment`.
-    """
-    cosine = dr.dot(normal, view)
-    reflected = 2 * cosine * normal - view
-    return filtered.eval(reflected, roughness) * albedo(cosine, roughness, metallic, base_color, eta)

@@ -13,8 +13,9 @@ import mitsuba as mi
 LANES = (4, 4)
 PIXELS = (2, 2)
 TILE = (LANES[0] * PIXELS[0], LANES[1] * PIXELS[1])
-#: 2DGS's screen-space low-pass: a surfel weighs at least exp(−LOW_PASS |δ|²/2), δ in pixels (σ² = 1/2 px²).
-LOW_PASS = 2.0
+#: Screen-space low-pass: a surfel weighs at least exp(−LOW_PASS |δ|²/2), δ in pixels. σ = ½ px, as renderers filter their
+#: pixels; 2DGS's σ² = ½ px² blurs creases.
+LOW_PASS = 4.0
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,158 @@
+"""The object reflected in itself, against brute force, Mitsuba's path tracer and finite differences."""
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from rgs_mi.camera import Camera
+from rgs_mi.proxies import Proxies
+from rgs_mi.shading import deferred
+from rgs_mi.shading.environment import Environment
+from rgs_mi.shading.indirect import Indirect
+from rgs_mi.surfel import CHANNELS, Surfels, rotation_from_normal
+
+from scenes import sphere_surfels
+
+SIZE = (96, 96)
+CAMERA = Camera.look_at([0, -3, 1.2], [0, 0, 0.3], [0, 0, 1], 40, SIZE)
+SH_0 = 0.28209479
+LIGHT = 0.4  # of the environment
+WALL = np.array([0.9, 0.3, 0.1])  # radiance
+
+
+def brute_force(surfels, origin, direction, solid=0.2):
+    """[R] number of the nearest quad that each ray meets (-1: none), and whether it meets its front."""
+    s = {name: value.astype(np.float64) for name, value in surfels.numpy().items()}
+    t_u, t_v, normal = (np.array(v).T for v in surfels.frames())
+    extent = np.sqrt(2 * np.log(np.maximum(s["opacities"] / solid, 1)))
+    nearest, number, front = np.full(len(origin), np.inf), np.full(len(origin), -1), np.zeros(len(origin), bool)
+    for i in range(len(surfels)):
+        cosine = direction @ normal[i]
+        t = ((s["centers"][i] - origin) @ normal[i]) / cosine
+        offset = origin + t[:, None] * direction - s["centers"][i]
+        half = extent[i] * s["scales"][i]
+        inside = (abs(offset @ t_u[i]) < half[0]) & (abs(offset @ t_v[i]) < half[1])
+        met = inside & (t > 0) & (t < nearest)
+        nearest[met], number[met], front[met] = t[met], i, cosine[met] < 0
+    return number, front
+
+
+@pytest.mark.parametrize("two_sided", [True, False])
+def test_rays_meet_what_brute_force_says(two_sided):
+    rng = np.random.default_rng(0)
+    surfels = replace(sphere_surfels(300, scale=0.3), two_sided=two_sided)
+    origin = rng.normal(size=(4000, 3))
+    direction = 0.5 * rng.normal(size=(4000, 3)) - origin  # inwards, mostly
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    normal = np.zeros((4000, 3))
+    found, number = Proxies(surfels).meet(mi.Point3f(origin.T), mi.Vector3f(normal.T), mi.Vector3f(direction.T))
+    expected, front = brute_force(surfels, origin, direction)
+    met = (expected >= 0) & (front | two_sided)
+    assert 0.1 < met.mean() < 0.9
+    differs = (found.numpy() != met) | met & (number.numpy() != expected)
+    assert differs.mean() < 1e-3  # rays along an edge, in single precision
+
+
+def plate(origin, across, up, count=60):
+    """Centres [count², 3] of surfels over the parallelogram that starts at ``origin``."""
+    x, y = np.meshgrid((np.arange(count) + 0.5) / count, (np.arange(count) + 0.5) / count)
+    return np.asarray(origin) + x.reshape(-1, 1) * np.asarray(across) + y.reshape(-1, 1) * np.asarray(up)
+
+
+def corner():
+    """A mirror on the floor, z = 0, and a wall behind it, y = 1, that shines: its own specular part is black, as its base
+    colour is."""
+    floor, wall = plate([-1, -1, 0], [2, 0, 0], [0, 2, 0]), plate([-1, 1, 0], [2, 0, 0], [0, 0, 1.5])
+    n, is_wall = len(floor), np.repeat([False, True], len(floor))
+    pick = lambda of_floor, of_wall: np.where(is_wall[:, None], of_wall, of_floor).astype(np.float32)
+    return Surfels.from_numpy({
+        "centers": np.concatenate([floor, wall]),
+        "rotations": np.concatenate([rotation_from_normal(np.tile(d, (n, 1))) for d in ([0.0, 0, 1], [0.0, -1, 0])]),
+        "scales": np.full((2 * n, 2), 2 / 60), "opacities": np.full((2 * n, 1), 0.99),
+        "sh": (pick(np.zeros(3), WALL) - 0.5) / SH_0,
+        "base_color": pick(np.ones(3), np.zeros(3)), "roughness": pick([0], [1]), "metallic": pick([1], [1]),
+        "delta_normal": np.zeros((2 * n, 3))}, two_sided=False)
+
+
+def image(surfels, kind, environment=None):
+    """Linear radiance; ``kind``: of `Indirect`, None: without."""
+    environment = environment or Environment(mi.TensorXf(np.full((16, 32, 3), LIGHT, np.float32)), np.eye(3))
+    indirect = kind and Indirect(kind, Proxies(surfels), surfels)
+    return deferred.render(surfels, CAMERA, deferred.Lighting(environment.filtered(), indirect=indirect or None)).color
+
+
+def array(color):
+    return dr.detach(color).numpy().T.reshape(*SIZE[::-1], 3)
+
+
+def truth():
+    """The same corner from Mitsuba's path tracer: a mirror and an area light."""
+    square = lambda matrix: mi.ScalarTransform4f(np.array(matrix, float))
+    return mi.render(mi.load_dict({
+        "type": "scene", "integrator": {"type": "path", "max_depth": 3, "hide_emitters": True},
+        "sensor": CAMERA.to_sensor_dict() | {"sampler": {"type": "independent"}},
+        "floor": {"type": "rectangle", "bsdf": {"type": "conductor", "material": "none"}},
+        "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.0},
+                 "to_world": square([[1, 0, 0, 0], [0, 0, -1, 1], [0, 0.75, 0, 0.75], [0, 0, 0, 1]]),
+                 "emitter": {"type": "area", "radiance": {"type": "rgb", "value": WALL.tolist()}}},
+        "light": {"type": "constant", "radiance": LIGHT}}), spp=64).numpy()[..., :3]
+
+
+def floor_reflecting(expected, radiance):
+    """[H, W] bool: pixels of the floor that reflect ``radiance`` in the image ``expected``, clear of edges, where surfels
+    reach beyond the rectangles that they stand for."""
+    rays = CAMERA.rays()
+    t = -CAMERA.origin[2] / rays[..., 2]
+    floor = (t > 0) & (abs((CAMERA.origin + t[..., None] * rays)[..., :2]) < 0.9).all(-1)
+    return ndimage.binary_erosion(floor & (abs(expected - radiance).max(-1) < 1e-3), iterations=3)
+
+
+def test_a_mirror_shows_the_wall_as_the_path_tracer_does():
+    mine, expected = array(image(corner(), "one_bounce")), truth()
+    for radiance, pixels in ((WALL, 1000), (LIGHT, 50)):
+        where = floor_reflecting(expected, radiance)
+        assert where.sum() > pixels
+        assert abs(mine - expected)[where].max() < 1e-3
+
+
+def test_kinds():
+    surfels = corner()
+    where = floor_reflecting(truth(), WALL)
+    assert abs(array(image(surfels, "visibility"))[where]).max() < 1e-3
+    assert abs(array(image(surfels, None))[where] - LIGHT).max() < 1e-3
+
+
+def test_gradients_equal_finite_differences():
+    """In what the surfels send to each other, and in the environment: rays stay where they are."""
+    rng = np.random.default_rng(1)
+    surfels = corner()
+    base = surfels.numpy()
+    shape = base["roughness"].shape
+    base |= {"roughness": np.full(shape, 0.15, np.float32), "metallic": np.full(shape, 0.6, np.float32),
+             "sh": base["sh"] + np.float32(0.5),  # a radiance of zero is a kink
+             "base_color": rng.uniform(0.3, 0.8, base["base_color"].shape).astype(np.float32)}
+    base["texels"] = rng.uniform(0.3, 0.9, (16, 32, 3)).astype(np.float32)
+    weights = rng.normal(size=(3, SIZE[0] * SIZE[1])).astype(np.float32)
+
+    def render(arrays):
+        surfels, texels = Surfels.from_numpy(arrays, two_sided=False), mi.TensorXf(arrays["texels"])
+        for value in [*(getattr(surfels, n) for n in CHANNELS), texels]:
+            dr.enable_grad(value)
+        return image(surfels, "one_bounce", Environment(texels, np.eye(3))), surfels, texels
+
+    color, surfels, texels = render(base)
+    without = array(image(surfels, None, Environment(texels, np.eye(3))))
+    assert (abs(array(color) - without).max(-1) > 0.05).sum() > 300  # indirect light is there to be differentiated
+    dr.backward(sum(dr.sum(c * mi.Float(w)) for c, w in zip(color, weights)))
+    for name in ("texels", "sh", "base_color", "metallic", "roughness"):
+        gradient = dr.grad(texels if name == "texels" else getattr(surfels, name)).numpy().astype(np.float64)
+        direction = np.copysign(rng.uniform(0.2, 1, gradient.shape), gradient)
+        value = lambda h: (render(base | {name: base[name] + h * direction})[0].numpy().astype(np.float64) * weights).sum()
+        central = lambda h: (value(h) - value(-h)) / (2 * h)
+        expected = (4 * central(1e-3) - central(2e-3)) / 3
+        rel = 1e-2 if name == "roughness" else 1e-3  # kinks between entries of the tables
+        assert (gradient * direction).sum() == pytest.approx(expected, rel=rel), name
