@@ -138,7 +138,7 @@ class Fit:
         w, size = self.settings.weights, photo.camera.size
         offset = dr.zeros(mi.Vector2f, len(self.model))
         dr.enable_grad(offset)
-        image = deferred.render(surfels, photo.camera, lighting, offset)
+        image = deferred.render(surfels, photo.camera, lighting, offset, squares=w.distortion > 0)
         maps = image.gbuffer.all
         rendered = losses.display(image.color, maps.alpha, self.settings.background)
         loss = losses.photometric(rendered, photo.color, size, w.dssim)
@@ -146,6 +146,8 @@ class Fit:
             loss += w.mask * losses.mask(maps.alpha, photo.alpha)
         if w.delta_normal > 0:
             loss += w.delta_normal * losses.delta_normal(image.gbuffer)
+        if w.distortion > 0:
+            loss += w.distortion * losses.distortion(maps, self.extent)
         consistency = dr.opaque(mi.Float, self._scheduled(w.consistency))
         loss += consistency * losses.depth_normal_consistency(image.gbuffer, photo.camera)
         share = size[0] * size[1] / (photo.size[0] * photo.size[1])  # these are means over the whole photograph

@@ -123,6 +123,12 @@ def depth_normal_consistency(gbuffer, camera):
     return dr.sum(1 - dr.dot(n, n_depth)) / (width * height)
 
 
+def distortion(maps, extent):
+    """2DGS's depth distortion, mean over the image of Σ_ij w_i w_j (t_i − t_j)² = 2 (Σw Σwt² − (Σwt)²), in units of
+    ``extent``², the object's radius: surfels along a ray draw together. ``maps``: `Maps` with squares."""
+    return dr.mean(2 * (maps.alpha * maps.square - dr.square(maps.depth))) / dr.opaque(mi.Float, float(extent) ** 2)
+
+
 def normal_smoothness(gbuffer, reflective, crease=0.0):
     """RGS's L_normal: mean squared forward difference of N from pixel to pixel, where both are ``reflective`` (β̂, [H, W]
     bool, NumPy). With ``crease``, d² counts as d² / (1 + d²/crease²): noise of a few degrees is smoothed, an edge of the

@@ -53,6 +53,7 @@ class Weights:
     mask: float = _within(0.1, 0, 1e3)
     # depth-normal consistency (2DGS), first and last, joined geometrically: early on it would hold the surface back
     consistency: tuple[float, float] = _within((0.05, 0.6), 0, 1e3)
+    distortion: float = _within(0.0, 0, 1e6)  # of the surfels along a ray (2DGS)
     normal: float = _within(0.1, 0, 1e3)  # smoothness of the normals of what is reflective (RGS, L_normal)
     crease: float = _within(0.1, 0, 1e3)  # difference of unit normals from pixel to pixel that it lets be; 0: none
     delta_normal: float = _within(0.0, 0, 1e3)  # length of the normals' residuals (RGS, L_Δn)

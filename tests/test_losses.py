@@ -8,8 +8,10 @@ from scipy import ndimage
 
 from rgs_mi import losses
 from rgs_mi.aligned import lanes as aligned
+from rgs_mi.camera import Camera
 from rgs_mi.color import srgb_encode
 from rgs_mi.splat.gbuffer import render_gbuffer
+from rgs_mi.surfel import Surfels, rotation_from_normal
 
 from scenes import orbit_camera, sphere_surfels
 
@@ -71,7 +73,6 @@ def test_display_is_the_srgb_curve_of_the_straight_colour():
 def test_depth_normals_agree_on_a_smooth_surface():
     """A densely covered sphere: depth normals are its normals, whichever way the camera turns."""
     surfels = sphere_surfels(4000, scale=1.0, opacity_shift=3)
-    from rgs_mi.surfel import Surfels, rotation_from_normal
     arrays = surfels.numpy()
     arrays["rotations"], arrays["delta_normal"] = rotation_from_normal(arrays["centers"]), 0 * arrays["delta_normal"]
     camera = orbit_camera(size=(96, 96))
@@ -85,7 +86,6 @@ def test_nothing_covered_costs_nothing():
     surfels, camera = sphere_surfels(5), orbit_camera(size=(32, 32))
     arrays = surfels.numpy()
     arrays["centers"] = arrays["centers"] + 100
-    from rgs_mi.surfel import Surfels
     gbuffer = render_gbuffer(Surfels.from_numpy(arrays), camera)
     assert losses.depth_normal_consistency(gbuffer, camera)[0] == 0
     assert losses.normal_smoothness(gbuffer, np.ones((32, 32), bool))[0] == 0
@@ -109,6 +109,19 @@ def test_normal_smoothness_equals_numpy(crease):
     expected = 2 * pairs.mean()
     assert len(pairs) > 100
     assert losses.normal_smoothness(gbuffer, smooth, crease)[0] == pytest.approx(expected, rel=1e-4)
+
+
+def test_distortion_is_the_sum_over_pairs():
+    """Three wide surfels, one behind the other, turned to the camera."""
+    camera = Camera.look_at([0, 0, -4], [0, 0, 0], [0, 1, 0], 30, (8, 8))
+    z, opacity = np.array([-0.3, 0.1, 0.2]), np.array([0.3, 0.5, 0.9])
+    fields = sphere_surfels(3).numpy() | {
+        "centers": np.stack([0 * z, 0 * z, z], 1), "rotations": rotation_from_normal(np.tile([0.0, 0, -1], (3, 1))),
+        "scales": np.full((3, 2), 1e3), "opacities": opacity[:, None]}
+    maps = render_gbuffer(Surfels.from_numpy(fields), camera, squares=True).all
+    w = opacity * np.concatenate([[1], np.cumprod(1 - opacity)[:-1]])
+    expected = (w[:, None] * w * (z[:, None] - z) ** 2).sum()
+    assert losses.distortion(maps, extent=2.0)[0] == pytest.approx(expected / 4, rel=1e-3)
 
 
 def test_delta_normal_is_its_mean_length():

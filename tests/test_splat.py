@@ -14,13 +14,13 @@ from rgs_mi.surfel import CHANNELS, Surfels
 
 from scenes import layered_surfels, orbit_camera, sphere_surfels
 
-MAPS = ("diffuse", "normal", "base_color", "roughness", "metallic", "delta_normal", "depth", "alpha")
+MAPS = ("diffuse", "normal", "base_color", "roughness", "metallic", "delta_normal", "depth", "square", "alpha")
 SORTED = Cutoffs(window=96)  # more than the surfels of any tile here that overlap
 SMOOTH = Cutoffs(alpha_min=1e-7, alpha_max=0.9999, transmittance_min=0, window=96)
 
 
 def render_gbuffer(surfels, camera, cutoffs=Cutoffs()):
-    return gbuffer.render_gbuffer(surfels, camera, cutoffs=cutoffs).all
+    return gbuffer.render_gbuffer(surfels, camera, cutoffs=cutoffs, squares=True).all
 
 
 def stacked(maps):
@@ -62,7 +62,7 @@ def test_forward_equals_reference(camera, count):
 
 def test_backward_equals_reference():
     surfels, camera = sphere_surfels(30, seed=3), orbit_camera(size=(32, 24))
-    weights = np.random.default_rng(0).normal(size=(16, 32 * 24)).astype(np.float32)
+    weights = np.random.default_rng(0).normal(size=(17, 32 * 24)).astype(np.float32)
     mine = gradients(render_gbuffer, surfels, camera, weights)
     reference = gradients(render_gbuffer_reference, surfels, camera, weights)
     for name in CHANNELS:
@@ -77,7 +77,7 @@ def test_window_brings_tiles_into_order():
 
     def image(shift, window):
         maps = render_gbuffer(surfels, camera.cropped(-shift, -shift, 104, 104), Cutoffs(window=window))
-        return stacked(maps).reshape(16, 104, 104)[:, shift:shift + 96, shift:shift + 96]
+        return stacked(maps).reshape(17, 104, 104)[:, shift:shift + 96, shift:shift + 96]
 
     seams = {window: np.square(image(0, window) - image(4, window)).mean() for window in (1, 16)}
     assert 0 < seams[16] < 0.1 * seams[1], seams
@@ -88,7 +88,7 @@ def test_window_brings_tiles_into_order():
 def test_gradients_equal_finite_differences(name, seed):
     camera = orbit_camera(size=(24, 24))
     base = layered_surfels(camera, seed).numpy()
-    weights = np.random.default_rng(1).normal(size=(16, 24 * 24)).astype(np.float32)
+    weights = np.random.default_rng(1).normal(size=(17, 24 * 24)).astype(np.float32)
     gradient = gradients(render_gbuffer, Surfels.from_numpy(base), camera, weights)[name].astype(np.float64)
     # Uphill in every number, or what they add would cancel and leave rounding to compare
     direction = np.copysign(np.random.default_rng(2).normal(size=base[name].shape), gradient) * np.abs(base[name]).mean()
@@ -105,7 +105,7 @@ def test_gradients_equal_finite_differences(name, seed):
 
 def test_forward_mode_equals_backward_mode():
     surfels, camera = sphere_surfels(20, seed=7), orbit_camera(size=(16, 16))
-    weights = np.random.default_rng(1).normal(size=(16, 256)).astype(np.float32)
+    weights = np.random.default_rng(1).normal(size=(17, 256)).astype(np.float32)
     gradient = gradients(render_gbuffer, surfels, camera, weights)
     rng = np.random.default_rng(3)
     expected = 0.0

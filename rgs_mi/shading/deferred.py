@@ -93,6 +93,6 @@ def _specular(gbuffer, camera, lighting):
     return specular
 
 
-def render(surfels, camera, lighting: Lighting | None, screen_offset=None) -> Image:
-    """Splat and `shade`; differentiable in the surfels' fields, the environment and the shader."""
-    return shade(render_gbuffer(surfels, camera, screen_offset), camera, lighting)
+def render(surfels, camera, lighting: Lighting | None, screen_offset=None, squares=False) -> Image:
+    """Splat (see `render_gbuffer`) and `shade`; differentiable in the surfels' fields, the environment and the shader."""
+    return shade(render_gbuffer(surfels, camera, screen_offset, squares=squares), camera, lighting)

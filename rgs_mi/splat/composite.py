@@ -3,7 +3,7 @@
 Per pixel, over its lane's surfels front to back, with T_1 = 1:
 
     α_i = o_i exp(−½ min(u² + v², LOW_PASS |δ|²)),   w_i = T_i α_i,   T_{i+1} = T_i − w_i,
-    image = Σ_i w_i (features_i, t_i, 1)                                                           (2)
+    image = Σ_i w_i (features_i, t_i, 1), and where asked t_i²                                     (2)
 
 The adjoint walks the same lists again, front to back, and stores nothing per step. With g_i the inner product of the
 pixel's adjoint with surfel i's vector in (2), and rest_i = Σ_{j>i} w_j g_j,
@@ -29,11 +29,12 @@ _MOST_COPIED = 2**26  # floats, in all threads together
 @dataclass(frozen=True)
 class Layout:
     """How ``features`` channels lie in a record (ten geometric numbers, then the features, padded) and in a pixel
-    (features, depth, alpha, padded), and the constants of the walk."""
+    (features, depth, alpha, with ``squares`` also depth², padded), and the constants of the walk."""
 
     size: tuple[int, int]
     features: int
     cutoffs: Cutoffs = Cutoffs()
+    squares: bool = False
 
     @property
     def record(self):
@@ -41,7 +42,12 @@ class Layout:
 
     @property
     def pixel(self):
-        return padded(self.features + 2)
+        return padded(self.values)
+
+    @property
+    def values(self):
+        """Numbers in a pixel, without padding."""
+        return self.features + 2 + self.squares
 
 
 def _walk(lists, layout, state, body):
@@ -101,11 +107,12 @@ class Composite(dr.CustomOp):
             for k, (x, y) in enumerate(centres):
                 hit = Hit(r, x, y, layout.cutoffs)
                 w = T[k] * hit.alpha
-                out[k] = [dr.fma(w, value, o) for o, value in zip(out[k], [*features, hit.t])] + [out[k][n + 1] + w]
+                alpha, squares = out[k][n + 1] + w, [dr.fma(w, hit.t * hit.t, o) for o in out[k][n + 2:]]
+                out[k] = [dr.fma(w, value, o) for o, value in zip(out[k], [*features, hit.t])] + [alpha, *squares]
                 T[k] = T[k] - w
             return T, out
 
-        out = _walk(lists, layout, lambda pixels: [[mi.Float(0)] * (n + 2) for _ in range(pixels)], body)
+        out = _walk(lists, layout, lambda pixels: [[mi.Float(0)] * layout.values for _ in range(pixels)], body)
         self.image = _scatter_image(out, layout)
         dr.eval(self.image)
         return self.image
@@ -132,9 +139,13 @@ class Composite(dr.CustomOp):
                 g = adjoint[k][n + 1]
                 for a, value in zip(adjoint[k], [*features, hit.t]):
                     g = dr.fma(a, value, g)
+                d_t = adjoint[k][n]
+                if layout.squares:
+                    g = dr.fma(adjoint[k][n + 2], hit.t * hit.t, g)
+                    d_t = dr.fma(2 * hit.t, adjoint[k][n + 2], d_t)
                 rest[k] = rest[k] - w * g
                 d_alpha = T[k] * g - rest[k] * dr.rcp(1 - hit.alpha)
-                local = hit.pull_back(r, d_alpha, w * adjoint[k][n]) + [w * a for a in adjoint[k][:n]]
+                local = hit.pull_back(r, d_alpha, w * d_t) + [w * a for a in adjoint[k][:n]]
                 total = [t + l for t, l in zip(total, local)] + total[len(local):]
                 T[k] = T[k] - w
             for q in range(stride):
@@ -157,11 +168,13 @@ class Composite(dr.CustomOp):
                 alpha_, t_ = hit.push_forward(r, r_)
                 T_, out_ = state[k]
                 w, w_ = T[k] * hit.alpha, T_ * hit.alpha + T[k] * alpha_
-                out_ = [o + w_ * f + w * f_ for o, f, f_ in zip(out_, [*values, hit.t], [*values_, t_])] + [out_[n + 1] + w_]
+                squares = [o + (w_ * hit.t + 2 * w * t_) * hit.t for o in out_[n + 2:]]
+                out_ = [o + w_ * f + w * f_ for o, f, f_ in zip(out_, [*values, hit.t], [*values_, t_])]
+                out_ += [state[k][1][n + 1] + w_, *squares]
                 state[k], T[k] = (T_ - w_, out_), T[k] - w
             return T, state
 
-        start = lambda pixels: [(mi.Float(0), [mi.Float(0)] * (n + 2)) for _ in range(pixels)]
+        start = lambda pixels: [(mi.Float(0), [mi.Float(0)] * layout.values) for _ in range(pixels)]
         state = _walk(self.lists, layout, start, body)
         self.set_grad_out(_scatter_image([out_ for _, out_ in state], layout))
 
@@ -170,6 +183,7 @@ class Composite(dr.CustomOp):
 
 
 def composite(projected, features, lists, layout):
-    """The image of (2): ``mi.Float`` of width H · W · layout.pixel, row-major, each pixel (features, depth, alpha, padding).
+    """The image of (2): ``mi.Float`` of width H · W · layout.pixel, row-major, each pixel (features, depth, alpha, perhaps
+    depth², padding).
     Differentiable in the records, in both modes."""
     return dr.custom(Composite, pack(projected.geometry + features), lists, layout)

@@ -20,6 +20,7 @@ class Maps:
       normal         Σ w (n + Δn), world space              ``mi.Vector3f``
       delta_normal   Σ w Δn                                 ``mi.Vector3f``
       base_color, roughness, metallic, depth (z), alpha = Σ w
+      square                                                depth², where `render_gbuffer` was asked for it, else None
     """
 
     diffuse: "mi.Color3f"
@@ -30,6 +31,7 @@ class Maps:
     delta_normal: "mi.Vector3f"
     depth: "mi.Float"
     alpha: "mi.Float"
+    square: "mi.Float | None" = None
 
 
 @dataclass
@@ -40,6 +42,7 @@ class GBuffer:
     size: tuple[int, int]
     image: "mi.Float"
     seen: "mi.Bool"
+    squares: bool = False
 
     @functools.cached_property
     def all(self) -> Maps:
@@ -48,18 +51,20 @@ class GBuffer:
 
     def maps(self, index) -> Maps:
         """The maps at pixels number ``index``."""
-        m = [v for q in range(4) for v in dr.gather(mi.Vector4f, self.image, index * 4 + q)]
+        packets = 5 if self.squares else 4
+        m = [v for q in range(packets) for v in dr.gather(mi.Vector4f, self.image, index * packets + q)]
         return Maps(mi.Color3f(*m[0:3]), mi.Vector3f(*m[3:6]), mi.Color3f(*m[6:9]), m[9], m[10], mi.Vector3f(*m[11:14]),
-                    m[14], m[15])
+                    m[14], m[15], m[16] if self.squares else None)
 
 
-def render_gbuffer(surfels, camera, screen_offset=None, cutoffs=Cutoffs()) -> GBuffer:
-    """Splat ``surfels`` into ``camera``; differentiable in all fields. ``screen_offset``: see `project`."""
+def render_gbuffer(surfels, camera, screen_offset=None, cutoffs=Cutoffs(), squares=False) -> GBuffer:
+    """Splat ``surfels`` into ``camera``; differentiable in all fields. ``screen_offset``: see `project`. ``squares``: make
+    `Maps.square` as well."""
     projected = project(surfels, camera, screen_offset)
     delta = surfels.column(mi.Vector3f, "delta_normal")
     features = [*surfels.radiance(projected.view), *(projected.normal + delta), *surfels.column(mi.Color3f, "base_color"),
                 surfels.column(mi.Float, "roughness"), surfels.column(mi.Float, "metallic"), *delta]
     dr.eval(projected.geometry, features)
     lists = lane_lists(projected, camera.size, cutoffs)
-    image = composite(projected, features, lists, Layout(camera.size, len(features), cutoffs))
-    return GBuffer(camera.size, image, lists.seen)
+    image = composite(projected, features, lists, Layout(camera.size, len(features), cutoffs, squares))
+    return GBuffer(camera.size, image, lists.seen, squares)

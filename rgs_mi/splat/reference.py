@@ -76,6 +76,7 @@ def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> Maps:
 
     delta = of(mi.Vector3f, "delta_normal")
     radiance = dr.gather(mi.Color3f, surfels.radiance(dr.normalize(centers - origin)), surfel)
+    z = dr.select(on_plane <= on_screen, t, z)
     columns = lambda kind, value: [value] if kind is mi.Float else value
     accumulate = lambda kind, value: kind(*[dr.block_sum(weight * c, n) for c in columns(kind, value)])
     return Maps(
@@ -83,5 +84,5 @@ def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> Maps:
         normal=accumulate(mi.Vector3f, dr.select(facing > 0, -normal, normal) + delta),
         base_color=accumulate(mi.Color3f, of(mi.Color3f, "base_color")),
         roughness=accumulate(mi.Float, of(mi.Float, "roughness")), metallic=accumulate(mi.Float, of(mi.Float, "metallic")),
-        delta_normal=accumulate(mi.Vector3f, delta), depth=accumulate(mi.Float, dr.select(on_plane <= on_screen, t, z)),
-        alpha=accumulate(mi.Float, mi.Float(1)))
+        delta_normal=accumulate(mi.Vector3f, delta), depth=accumulate(mi.Float, z),
+        alpha=accumulate(mi.Float, mi.Float(1)), square=accumulate(mi.Float, z * z))
