@@ -41,9 +41,9 @@ class Variant:
     scenes: int | None = None
 
 
-#: Cross-view shape consistency regularisation; in the paper's loss it stands in the place of 2DGS's own consistency. The
-#: shape that views agree on is the visual hull's here, and surfels start on it.
+#: What surfels at random lack: the shape that views agree on, and rates for normals that are nearly right.
 HULL = ("start.hull=true", "rates.rotations=[2e-3,2e-4]")
+#: Cross-view shape consistency regularisation; in the paper's loss it stands in the place of 2DGS's own consistency.
 CSCR = (*HULL, "weights.depth=1e-3", "weights.normal=1e-2", "weights.crease=0", "weights.delta_normal=1e-3",
         "weights.consistency=[0,0]", "rates.delta_normal=[1e-3,1e-4]", "prior.name=hull")
 #: Reflection-guided densification.
@@ -57,10 +57,10 @@ VARIANTS = {
     "rd": Variant("+ RD", "deferred2dgs", RD),
     "full": Variant("full: + CSCR + RD", "paper"),  # the preset is that sum, as a test makes sure
     "fast": Variant("fast: the defaults", "fast"),
+    "no-indirect": Variant("fast, reflections of the light alone", "fast", ("indirect=none",), "fast", 2),
     "no-depth": Variant("full, no depth prior", "paper", ("weights.depth=0",), "full", 2),
     "no-normal": Variant("full, no L_normal", "paper", ("weights.normal=0",), "full", 2),
     "no-delta-normal": Variant("full, no Δn", "paper", ("weights.delta_normal=0", "rates.delta_normal=[0,0]"), "full", 2),
-    "no-indirect": Variant("fast, reflections of the light alone", "fast", ("indirect=none",), "fast", 2),
     "no-guided": Variant("full, no RD", "paper", ("density.guided=false",), "full", 2),
 }
 
@@ -222,7 +222,7 @@ def _photographs(xml, data, quiet):
     for view in [*dataset.train, *dataset.test]:
         for part in (view.name.encode(), view.camera.to_world.tobytes(), view.pixels.tobytes()):
             digest.update(part)
-    return digest.hexdigest(), results.shown(dataset.test or dataset.train[:results.SHOWN])[::2]
+    return digest.hexdigest(), results.shown(results.judged(dataset))[::2]
 
 
 def _check_photographs(folder, digest):

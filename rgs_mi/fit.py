@@ -80,17 +80,25 @@ class Fit:
         return min(s.sh_order, 1 + int((self.progress - s.sh_start) / (1 - s.sh_start + 1e-9) * s.sh_order))
 
     @property
+    def _reflects(self):
+        """Whether reflections are shaded by now."""
+        return self.specular != "none" and self.progress >= self.settings.specular_start
+
+    @property
     def _sees_itself(self):
         """Whether the object is reflected in itself by now."""
-        return self.settings.indirect != "none" and self.progress >= self.settings.indirect_start
+        s = self.settings
+        return self._reflects and s.indirect != "none" and self.progress >= s.indirect_start
 
     def lighting(self, surfels, proxies=None) -> deferred.Lighting | None:
         """How the model's ``surfels`` are shaded: None where nothing specular is, or not yet. ``proxies``: what reflected
         rays meet (None: the surfels as they are)."""
-        if self.specular == "none" or self.progress < self.settings.specular_start:
+        if not self._reflects:
             return None
-        indirect = self._sees_itself and Indirect(self.settings.indirect, proxies or Proxies(surfels), surfels)
-        return deferred.Lighting(self.model.environment().filtered(), self.eta, self.model.shader(), indirect or None)
+        indirect = None
+        if self._sees_itself:
+            indirect = Indirect(self.settings.indirect, proxies or Proxies(surfels), surfels)
+        return deferred.Lighting(self.model.environment().filtered(), self.eta, self.model.shader(), indirect)
 
     def step(self):
         """One step of the optimiser on the next few views, and density control when it is due."""

@@ -28,7 +28,7 @@ def write(fit, scene, folder, quiet):
     Raises: UserError where the disk is full or the folder can't be written.
     """
     held_out = bool(fit.dataset.test)
-    views = fit.dataset.test or fit.dataset.train[:SHOWN]
+    views = judged(fit.dataset)
     background = fit.settings.background
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
@@ -55,6 +55,11 @@ def write(fit, scene, folder, quiet):
     lines = _summary(figures)
     pictures.contact_sheet(folder / SHEET, rows, environment.texels.numpy(), background, folder.resolve().name, lines)
     print("\n".join([*lines, "", *map(str, (folder / SHEET, folder / METRICS, *exported, folder / "test"))]))
+
+
+def judged(dataset) -> list:
+    """The views that results are of: the held-out ones, or a few of those that are fitted."""
+    return dataset.test or dataset.train[:SHOWN]
 
 
 def shown(views) -> list:

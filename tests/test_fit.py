@@ -156,6 +156,21 @@ def test_every_view_is_used_once_a_round(dataset):
     assert all(sorted(r) == list(range(6)) for r in rounds) and len({tuple(r) for r in rounds}) > 1
 
 
+def test_distortion_draws_surfels_together(dataset):
+    """Of three shells, one in the other: the depths that a ray meets come closer."""
+    spread = {}
+    for weight in (0.0, 1000.0):  # as 2DGS has it
+        weights = Weights(dssim=0, mask=0, normal=0, distortion=weight)
+        settings = replace(SETTINGS, weights=weights, rates=Rates(centers=(5e-3, 5e-3)))  # far in few steps
+        fit = Fit(dataset, model(), settings, 1.0)
+        fit.model.set("centers", fit.model.numpy("centers") * np.linspace(0.9, 1.1, 3)[np.arange(300) % 3, None])
+        while fit.progress < 1:
+            fit.step()
+        maps = deferred.render(fit.model.surfels(0), dataset.train[0].camera, None, squares=True).gbuffer.all
+        spread[weight] = losses.distortion(maps, 1.0)[0]
+    assert spread[1000.0] < 0.7 * spread[0.0]
+
+
 @pytest.mark.parametrize("indirect", ["none", "one_bounce"])
 def test_no_kernel_is_compiled_after_warm_up(dataset, indirect, monkeypatch):
     """Also with another number of surfels: density control changes it all the time."""

@@ -1,5 +1,6 @@
 """The object reflected in itself, against brute force, Mitsuba's path tracer and finite differences."""
 
+import functools
 from dataclasses import replace
 
 import drjit as dr
@@ -89,6 +90,7 @@ def array(color):
     return dr.detach(color).numpy().T.reshape(*SIZE[::-1], 3)
 
 
+@functools.cache
 def truth():
     """The same corner from Mitsuba's path tracer: a mirror and an area light."""
     square = lambda matrix: mi.ScalarTransform4f(np.array(matrix, float))
@@ -111,8 +113,9 @@ def floor_reflecting(expected, radiance):
     return ndimage.binary_erosion(floor & (abs(expected - radiance).max(-1) < 1e-3), iterations=3)
 
 
-def test_a_mirror_shows_the_wall_as_the_path_tracer_does():
-    mine, expected = array(image(corner(), "one_bounce")), truth()
+@pytest.mark.parametrize("two_sided", [True, False])
+def test_a_mirror_shows_the_wall_as_the_path_tracer_does(two_sided):
+    mine, expected = array(image(replace(corner(), two_sided=two_sided), "one_bounce")), truth()
     for radiance, pixels in ((WALL, 1000), (LIGHT, 50)):
         where = floor_reflecting(expected, radiance)
         assert where.sum() > pixels

@@ -28,13 +28,13 @@ class Lighting:
     def specular(self, normal, view, roughness, metallic, base_color, point=None):
         """f_φ(C_s), radiance that surfaces reflect towards ``view``, ``mi.Color3f``, by split sum.
 
-        ``normal``, ``view``: unit, world space, ``view`` from the surface to the camera. ``point``: where the surfaces are
-        (None: they reflect the environment alone).
+        ``normal``, ``view``: unit, world space, ``view`` from the surface to the camera. ``point``: where the surfaces are,
+        which `indirect` needs (None: they reflect the environment alone).
         """
         cosine = dr.dot(normal, view)
         reflected = 2 * cosine * normal - view
         incoming = self.filtered.eval(reflected, roughness)
-        if point is not None and self.indirect is not None:
+        if point is not None:
             incoming = self.indirect.cover(incoming, point, normal, reflected, self)
         C_s = incoming * split_sum.albedo(cosine, roughness, metallic, base_color, self.eta)
         return C_s if self.shader is None else self.shader(C_s, roughness, cosine)
@@ -86,8 +86,10 @@ def _specular(gbuffer, camera, lighting):
         m = gbuffer.maps(index)
         mean = dr.rcp(m.alpha)
         normal, direction = dr.normalize(m.normal), pixel_directions(camera, index)
-        rotation, origin, *_ = opaque(camera)
-        point = origin + direction * (m.depth * mean / (rotation @ direction).z)
+        point = None
+        if lighting.indirect is not None:
+            rotation, origin, *_ = opaque(camera)
+            point = origin + direction * (m.depth * mean / (rotation @ direction).z)
         C_s = lighting.specular(normal, -direction, m.roughness * mean, m.metallic * mean, m.base_color * mean, point)
         dr.scatter(specular, C_s * m.alpha, index)
     return specular

@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import UserError
+from ..splat.hit import adding
 from . import prefilter as _prefilter
 
 
@@ -79,7 +80,8 @@ class FilteredEnvironment:
         left = dr.select(column < 0, columns - 1, mi.UInt32(dr.maximum(column, 0)))
         right = dr.select(left + 1 < columns, left + 1, 0)
         above = first + mi.UInt32(row) * columns
-        fetch = lambda i: dr.gather(mi.Vector4f, self.texels, i, mode=dr.ReduceMode.Expand)
+        mode = adding(dr.width(self.texels))  # of the derivative
+        fetch = lambda i: dr.gather(mi.Vector4f, self.texels, i, mode=mode)
         top = dr.lerp(fetch(above + left), fetch(above + right), fx)
         bottom = dr.lerp(fetch(above + columns + left), fetch(above + columns + right), fx)
         value = dr.lerp(top, bottom, fy)

@@ -29,4 +29,3 @@ def albedo(cosine, roughness, metallic, base_color, eta=DEFAULT_ETA):
                     dr.lerp(fetch(index + tables.ROUGHNESSES), fetch(index + tables.ROUGHNESSES + 1), fx), fy)
     dielectric, black, white = value
     return (1 - metallic) * dielectric + metallic * (base_color * (white - black) + black)
-

@@ -19,11 +19,9 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .hit import PACKET, Hit, fetch, pack, padded
+from .hit import PACKET, Hit, adding, fetch, pack, padded
 from .project import GEOMETRY
 from .tiles import Cutoffs, lane_pixels
-
-_MOST_COPIED = 2**26  # floats, in all threads together
 
 
 @dataclass(frozen=True)
@@ -124,9 +122,7 @@ class Composite(dr.CustomOp):
         rest = [sum((a * o for a, o in zip(adj, out)), mi.Float(0)) for adj, out in zip(adjoint, image)]
         dr.eval(adjoint, rest)
         gradient = dr.zeros(mi.Float, dr.width(self.record))
-        # Lanes meet different surfels at a time: a copy for each thread is twice as fast, while it fits into memory
-        copies = dr.width(gradient) * dr.thread_count() <= _MOST_COPIED
-        mode = dr.ReduceMode.Expand if copies else dr.ReduceMode.Local
+        mode = adding(dr.width(gradient))
         stride = layout.record // PACKET
 
         def body(surfel, centres, T, rest):
