@@ -6,7 +6,7 @@ import sys
 
 import mitsuba as mi
 
-_MODULES = ("procedural", "surfels", "rgs_deferred")
+_MODULES = ("procedural", "lanes", "surfels", "rgs_deferred")
 
 
 def _load(_old, new):

@@ -9,8 +9,17 @@ what a principled BSDF with the G-buffer's material reflects of the environment 
 
  * - specular
    - |string|
-   - ``split_sum``: the environment filtered by roughness times the directional albedo; ``none``: diffuse radiance only
-     (Default: ``split_sum``)
+   - ``split_sum``: the environment filtered by roughness times the directional albedo; ``monte_carlo``: samples of BSDF
+     and emitter, free of bias; ``none``: diffuse radiance only (Default: ``split_sum``)
+
+ * - samples
+   - |int|
+   - Samples of ``monte_carlo``, of BSDF and emitter each, at every point of a pixel (Default: 16)
+
+ * - diffuse
+   - |string|
+   - ``radiance``: the surfels' own, spherical harmonics; ``lit``: what their base colour, as a principled BSDF's, reflects
+     of the environment (Default: ``radiance``)
 
  * - indirect
    - |string|
@@ -40,9 +49,9 @@ coverage: divide by ``alpha.Y`` for means.
 
 The scene needs an ``envmap`` or ``constant`` emitter and a ``perspective`` sensor; other shapes and emitters are
 ignored. ``mi.render`` differentiates, in both modes, with respect to all fields of the surfels and the radiance of the
-environment, not to the sensor nor the shader's weights. Nothing is random: ``spp``, rounded up to a square, is the
-number of points of a regular grid in each pixel, over which the pixel is averaged whatever the film's reconstruction
-filter.
+environment, not to the sensor nor the shader's weights. ``spp``, rounded up to a square, is the number of points of a
+regular grid in each pixel, over which the pixel is averaged whatever the film's reconstruction filter. Nothing is random
+but ``monte_carlo``, whose samples ``seed`` decides.
 """
 
 import math
@@ -54,9 +63,11 @@ import mitsuba as mi
 from rgs_mi.camera import Camera
 from rgs_mi.errors import UserError
 from rgs_mi.proxies import Proxies
-from rgs_mi.shading import deferred, indirect, prefilter
-from rgs_mi.shading.environment import Environment, FilteredEnvironment
+from rgs_mi.shading import deferred, indirect
+from rgs_mi.shading.environment import Environment
+from rgs_mi.shading.monte_carlo import SAMPLES, MonteCarlo
 from rgs_mi.shading.shader import Shader
+from rgs_mi.shading.split_sum import SplitSum
 from rgs_mi.splat.gbuffer import render_gbuffer
 from rgs_mi.surfel import CHANNELS
 
@@ -64,7 +75,8 @@ from .surfels import SurfelShape, resolve
 
 AOVS = {"depth": "T", "normal": "XYZ", "albedo": "RGB", "roughness": "Y", "metallic": "Y", "alpha": "Y",
         "specular": "RGB", "diffuse": "RGB"}
-ESTIMATORS = ("split_sum", "none")
+ESTIMATORS = ("split_sum", "monte_carlo", "none")
+DIFFUSE = ("radiance", "lit")
 
 
 class DeferredIntegrator(mi.SamplingIntegrator):
@@ -72,12 +84,14 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         super().__init__(props)  # takes hide_emitters
         if not mi.is_rgb:
             raise UserError(f"rgs_deferred: variant '{mi.variant()}' is not supported: use llvm_ad_rgb or cuda_ad_rgb")
-        self.specular = props.get("specular", "split_sum")
-        if self.specular not in ESTIMATORS:
-            raise UserError(f"rgs_deferred: unknown specular '{self.specular}': choose one of {', '.join(ESTIMATORS)}")
-        self.indirect = props.get("indirect", "none")
-        if self.indirect not in indirect.KINDS:
-            raise UserError(f"rgs_deferred: unknown indirect '{self.indirect}': choose one of {', '.join(indirect.KINDS)}")
+        self.specular = _choice(props, "specular", "split_sum", ESTIMATORS)
+        self.diffuse = _choice(props, "diffuse", "radiance", DIFFUSE)
+        if self.diffuse == "lit" and self.specular == "none":
+            raise UserError("rgs_deferred: diffuse 'lit' needs an estimator: choose another specular than 'none'")
+        self.samples = props.get("samples", SAMPLES)
+        if self.samples < 1:
+            raise UserError(f"rgs_deferred: samples is {self.samples}: needs at least 1")
+        self.indirect = _choice(props, "indirect", "none", indirect.KINDS)
         self.shader_file = resolve(props.get("shader", ""))
         self.shader = Shader.load(self.shader_file) if self.shader_file else None
         self.aovs = [name.strip() for name in props.get("aovs", "").split(",") if name.strip()]
@@ -96,7 +110,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         film.prepare(self.aov_names())
         samples = math.ceil(math.sqrt(spp or sensor.sampler().sample_count()))
         has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-        channels = self._channels(scene, Camera.from_sensor(sensor), samples, has_alpha)
+        channels = self._channels(scene, Camera.from_sensor(sensor), samples, has_alpha, seed)
         film.put_block(mi.ImageBlock(channels, film.crop_offset()))
         image = film.develop() if develop else mi.TensorXf()
         if evaluate:
@@ -119,33 +133,37 @@ class DeferredIntegrator(mi.SamplingIntegrator):
 
     # ---- One image ----
 
-    def _channels(self, scene, camera, samples, has_alpha):
+    def _channels(self, scene, camera, samples, has_alpha, seed):
         """[height, width, channels] in the layout of the film's block: R, G, B, (alpha,) weight, AOVs."""
         width, height = camera.size
         camera = camera.resized(width * samples, height * samples)
         surfels, eta = _surfels(scene)
-        filtered = self._filtered_environment(scene)
+        environment = self._environment(scene)
         gbuffer = render_gbuffer(surfels, camera)
         maps = gbuffer.all
-        image = deferred.shade(gbuffer, camera, self._lighting(surfels, eta, filtered))
+        image = deferred.shade(gbuffer, camera, self._lighting(scene, surfels, eta, environment, seed))
         rays = deferred.pixel_directions(camera, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]))
         color, alpha = image.color, maps.alpha
-        if not self.hide_emitters and filtered is not None:
-            color, alpha = color + (1 - alpha) * filtered.eval(rays), mi.Float(1)
+        if not self.hide_emitters and environment is not None:
+            color, alpha = color + (1 - alpha) * environment.eval(rays), mi.Float(1)
         values = [*color, *([alpha] if has_alpha else []), mi.Float(1)]
         for name in self.aovs:
             values += _aov(name, image, maps, camera, rays)
         return _average(values, width, height, samples)
 
-    def _lighting(self, surfels, eta, filtered):
+    def _lighting(self, scene, surfels, eta, environment, seed):
         if self.specular == "none":
             return None
         each_other = None
         if self.indirect != "none":
             each_other = indirect.Indirect(self.indirect, Proxies(surfels), surfels)
-        return deferred.Lighting(filtered, eta, self.shader, each_other)
+        if self.specular == "split_sum":
+            estimator = SplitSum(environment, eta)
+        else:
+            estimator = MonteCarlo(environment, scene.environment(), eta, self.samples, dr.opaque(mi.UInt32, seed))
+        return deferred.Lighting(estimator, self.shader, each_other, self.diffuse == "lit")
 
-    def _filtered_environment(self, scene):
+    def _environment(self, scene):
         """The scene's environment, filtered as the estimator needs it; kept until texels change."""
         emitter = scene.environment()
         if emitter is None:
@@ -153,14 +171,20 @@ class DeferredIntegrator(mi.SamplingIntegrator):
                 return None
             raise UserError("rgs_deferred: the scene has no environment: add an 'envmap' or 'constant' emitter")
         environment = Environment.from_emitter(emitter)
-        if self.specular == "none":
-            mirror = prefilter.Prefilter(environment.size, (environment.size,), ())
-            return FilteredEnvironment(prefilter.apply(environment.texels.array, mirror), mirror, environment)
+        if self.specular != "split_sum":
+            return environment.unfiltered()
         if dr.grad_enabled(environment.texels):
             return environment.filtered()
         if self.filtered is None or not _equal(self.filtered.environment.texels, environment.texels):
             self.filtered = environment.filtered()
         return replace(self.filtered, environment=environment)
+
+
+def _choice(props, name, default, choices):
+    value = props.get(name, default)
+    if value not in choices:
+        raise UserError(f"rgs_deferred: unknown {name} '{value}': choose one of {', '.join(choices)}")
+    return value
 
 
 def _surfels(scene):

@@ -55,13 +55,14 @@ VARIANTS = {
     "hull": Variant("+ start on the hull", "deferred2dgs", HULL),
     "cscr": Variant("+ CSCR", "deferred2dgs", CSCR),
     "rd": Variant("+ RD", "deferred2dgs", RD),
-    "full": Variant("full: + CSCR + RD", "paper"),  # the preset is that sum, as a test makes sure
+    "full": Variant("full: + CSCR + RD", "deferred2dgs", CSCR + RD),
     "fast": Variant("fast: the defaults", "fast"),
+    "paper": Variant("full, multi-view steps (MVGS)", "paper", (), "full", 2),
     "no-indirect": Variant("fast, reflections of the light alone", "fast", ("indirect=none",), "fast", 2),
-    "no-depth": Variant("full, no depth prior", "paper", ("weights.depth=0",), "full", 2),
-    "no-normal": Variant("full, no L_normal", "paper", ("weights.normal=0",), "full", 2),
-    "no-delta-normal": Variant("full, no Δn", "paper", ("weights.delta_normal=0", "rates.delta_normal=[0,0]"), "full", 2),
-    "no-guided": Variant("full, no RD", "paper", ("density.guided=false",), "full", 2),
+    "no-depth": Variant("full, no depth prior", "deferred2dgs", (*CSCR, *RD, "weights.depth=0"), "full", 2),
+    "no-normal": Variant("full, no L_normal", "deferred2dgs", (*CSCR, *RD, "weights.normal=0"), "full", 2),
+    "no-delta-normal": Variant("full, no Δn", "deferred2dgs",
+                               (*CSCR, *RD, "weights.delta_normal=0", "rates.delta_normal=[0,0]"), "full", 2),
 }
 
 #: The paper's ablation, means over Shiny Blender.

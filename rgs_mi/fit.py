@@ -15,14 +15,15 @@ from .photographs import Photographs
 from .proxies import Proxies
 from .shading import deferred
 from .shading.indirect import Indirect
-from .shading.split_sum import DEFAULT_ETA
+from .shading.monte_carlo import SAMPLES, MonteCarlo
+from .shading.split_sum import DEFAULT_ETA, SplitSum
 from .surfel import CHANNELS, Surfels
 
 #: Rate of each parameter: the field of `Rates` that it obeys.
 _RATES = {"centers": "centers", "rotations": "rotations", "log_scales": "scales", "logit_opacities": "opacities",
           "sh_dc": "sh_dc", "sh_rest": "sh_rest", "logit_base_color": "base_color", "logit_roughness": "roughness",
           "logit_metallic": "metallic", "delta_normal": "delta_normal", ENVIRONMENT: "environment", SHADER: "shader"}
-_REBUILD = 50  # steps from one tree of what reflected rays meet to the next
+_REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
 _DIVERGED = 10  # steps in a row without a finite error
 
 
@@ -41,7 +42,7 @@ class Fit:
         self.step_number, self.views_used, self.elapsed = 0, 0, 0.0
         self.gradients = Gradients(len(model))
         self.photographs = None
-        self.proxies = None  # what reflected rays meet
+        self.proxies = self.emitter = None  # what reflected rays meet; what samples the light
         self._reflective = {}  # (camera, boxes) of what was reflective when a view was last seen
         self.psnr, self.failures = 0.0, 0
 
@@ -90,15 +91,36 @@ class Fit:
         s = self.settings
         return self._reflects and s.indirect != "none" and self.progress >= s.indirect_start
 
-    def lighting(self, surfels, proxies=None) -> deferred.Lighting | None:
-        """How the model's ``surfels`` are shaded: None where nothing specular is, or not yet. ``proxies``: what reflected
-        rays meet (None: the surfels as they are)."""
+    def lighting(self, surfels, training=False) -> deferred.Lighting | None:
+        """How the model's ``surfels`` are shaded: None where nothing specular is, or not yet. ``training``: as a step has
+        it, with what reflected rays meet, and the light's sampling, of some steps ago."""
         if not self._reflects:
             return None
         indirect = None
         if self._sees_itself:
-            indirect = Indirect(self.settings.indirect, proxies or Proxies(surfels), surfels)
-        return deferred.Lighting(self.model.environment().filtered(), self.eta, self.model.shader(), indirect)
+            indirect = Indirect(self.settings.indirect, self.proxies if training else Proxies(surfels), surfels)
+        return deferred.Lighting(self._estimator(training), self.model.shader(), indirect)
+
+    def _estimator(self, training):
+        """Of the specular integral, by now."""
+        environment, s = self.model.environment(), self.settings
+        if not self._samples_light:
+            return SplitSum(environment.filtered(), self.eta)
+        emitter = self.emitter if training else environment.emitter()
+        return MonteCarlo(environment.unfiltered(), emitter, self.eta, s.monte_carlo_samples if training else SAMPLES,
+                          dr.opaque(mi.UInt32, self.step_number), paired=training)
+
+    @property
+    def _samples_light(self):
+        """Whether the specular integral is sampled by now."""
+        return self.specular == "monte_carlo" and self.progress >= self.settings.monte_carlo_start
+
+    def _refresh(self, surfels):
+        """Rebuild what is used for many steps."""
+        if self.step_number % _REBUILD == 0 or self.proxies is None:
+            self.proxies = Proxies(surfels) if self._sees_itself else None
+        if self.step_number % _REBUILD == 0 or self.emitter is None:
+            self.emitter = self.model.environment().emitter() if self._samples_light else None
 
     def step(self):
         """One step of the optimiser on the next few views, and density control when it is due."""
@@ -109,9 +131,8 @@ class Fit:
         self._set_rates()
         views = self._next_views(stage.views)
         surfels = self.model.surfels(self.sh_order)
-        if self.proxies is None or self.step_number % _REBUILD == 0:
-            self.proxies = Proxies(surfels) if self._sees_itself else None
-        lighting = self.lighting(surfels, self.proxies)
+        self._refresh(surfels)
+        lighting = self.lighting(surfels, training=True)
         # The views share what lies before them: their gradients meet in leaves there, and go the rest of the way once.
         shared = [*(getattr(surfels, name) for name in CHANNELS), *(lighting.learned() if lighting else [])]
         leaves = [type(v)(dr.detach(v)) for v in shared]

@@ -104,5 +104,6 @@ def _integrator(scene, path):
     own = scene.integrator()
     if not hasattr(own, "aov_names") or not hasattr(own, "specular"):
         raise UserError(f"{path}: maps come from the integrator 'rgs_deferred' only: leave out --aovs")
-    return mi.load_dict({"type": "rgs_deferred", "specular": own.specular, "indirect": own.indirect,
-                         "shader": own.shader_file, "hide_emitters": own.hide_emitters, "aovs": ",".join(AOVS)})
+    kept = ("specular", "diffuse", "samples", "indirect", "hide_emitters")
+    return mi.load_dict({"type": "rgs_deferred", "shader": own.shader_file, "aovs": ",".join(AOVS)}
+                        | {name: getattr(own, name) for name in kept})

@@ -95,6 +95,10 @@ class Settings:
     shader: Literal["identity", "mlp"] = "identity"  # f_φ of C = C_d + f_φ(C_s): nothing, or a tiny network trained along
     indirect: Literal["none", "visibility", "one_bounce"] = "one_bounce"  # what reflected rays that meet surfels bring
     indirect_start: float = _within(0.1, 0, 1)  # fraction of the fit from which they are traced
+    # Where the scene's integrator asks for monte_carlo: the fraction of the fit from which it takes over from split_sum, and
+    # its samples a pixel
+    monte_carlo_start: float = _within(0.8, 0, 1)
+    monte_carlo_samples: int = _within(4, 1, 4096)
     sh_order: int = _within(2, 0, 3)
     sh_start: float = _within(0.4, 0, 1)  # fraction of the fit from which view-dependent diffuse is learned
     checkpoint_seconds: float = _within(20, 0, 1e6)

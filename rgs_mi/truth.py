@@ -26,6 +26,7 @@ import numpy as np
 from .camera import Camera
 from .errors import UserError
 from .load import load_scene
+from .progress import Progress
 
 FOV = 39.6                  # degrees, Blender's default camera (0.691 rad)
 MARGIN = 1.02               # keeps the object's bounding sphere off the frame
@@ -281,19 +282,16 @@ def render_dataset(xml, out, *, train: int = 60, test: int = 20, size: int = 400
                for split, ds in directions.items()}
     views = [(split, i, camera) for split, cs in cameras.items() for i, camera in enumerate(cs)]
     renderer = Renderer(scene, size)
-    for number, (split, i, camera) in enumerate(_progress(views, f"rendering {xml.name}", quiet)):
-        stem = out / split / f"r_{i}"
-        if not stem.with_suffix(".png").is_file():
-            samples = spp * (TEST_SPP if split == "test" else 1)
-            _write_view(stem, renderer.radiance(camera, samples, seed * len(views) + number), renderer.aov(camera))
+    with Progress(quiet=quiet, label=f"rendering {xml.name}") as progress:
+        for number, (split, i, camera) in enumerate(views):
+            stem = out / split / f"r_{i}"
+            if not stem.with_suffix(".png").is_file():
+                samples = spp * (TEST_SPP if split == "test" else 1)
+                _write_view(stem, renderer.radiance(camera, samples, seed * len(views) + number), renderer.aov(camera))
+            progress.update((number + 1) / len(views), views=number + 1)
     for split, cs in cameras.items():
         frames = [_frame(split, i, camera) for i, camera in enumerate(cs)]
         _write_json(out / f"transforms_{split}.json", {"camera_angle_x": math.radians(FOV), "frames": frames})
     _write_json(out / "truth.json", {"key": key, "complete": True})
     return out
 
-
-def _progress(views: list, text: str, quiet: bool):
-    from rich.progress import track
-
-    return track(views, text, disable=quiet)

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,10 +69,11 @@ def settings(suite, variant):
     return FitScene.load(scene, captures / "one").settings(v.preset, v.overrides)
 
 
-def test_full_is_baseline_and_both_parts(suite):
+def test_paper_is_baseline_both_parts_and_multi_view_steps(suite):
     scene = FitScene.load(suite[0], suite[1] / "one")
-    assert scene.settings("deferred2dgs", ablate.CSCR + ablate.RD) == settings(suite, "full")
-    assert scene.settings("paper") == settings(suite, "full") != settings(suite, "cscr") != settings(suite, "baseline")
+    paper, full = settings(suite, "paper"), settings(suite, "full")
+    assert [s.views for s in paper.stages] == [48, 24, 12, 4] and [s.downscale for s in paper.stages] == [8, 4, 2, 1]
+    assert replace(paper, stages=full.stages) == full != settings(suite, "cscr") != settings(suite, "baseline")
     assert all(v.against in ablate.VARIANTS for v in ablate.VARIANTS.values())
     assert all(scene.settings(v.preset, v.overrides) for v in ablate.known_variants().values())
 
@@ -81,7 +83,7 @@ def test_plan(suite, tmp_path):
     whole = ablate.plan(captures, scene, seeds=[0, 2], out=tmp_path, minutes=3)
     assert len(whole) == 2 * 2 * len(ablate.VARIANTS) and all(job.asked for job in whole)
     assert len({job.folder for job in whole}) == len(whole)
-    assert whole[0].folder == tmp_path / "one" / "sh2dgs" and whole[-1].folder == tmp_path / "two" / "no-guided-2"
+    assert whole[0].folder == tmp_path / "one" / "sh2dgs" and whole[-1].folder == tmp_path / "two" / "no-delta-normal-2"
     assert {job.settings["minutes"] for job in whole} == {3} and whole[-1].settings["seed"] == 2
     some = ablate.plan(captures, scene, scenes=["two"], variants=["full", "preview"], out=tmp_path)
     assert [job.folder.relative_to(tmp_path).parts for job in some if job.asked] == [("two", "full"), ("two", "preview")]
@@ -165,16 +167,16 @@ def test_failures_are_told(suite, tmp_path, inside, monkeypatch, capsys):
     optimize = ablate.optimize
 
     def explode(xml, **options):
-        if "density.guided=false" in options["overrides"]:
+        if "weights.depth=0" in options["overrides"]:
             raise UserError("out | of luck")
         return optimize(xml, **options)
 
     monkeypatch.setattr(ablate, "optimize", explode)
-    assert call((scene, tmp_path / "suite"), tmp_path / "out", variants=["no-guided", "full"]) == 3
+    assert call((scene, tmp_path / "suite"), tmp_path / "out", variants=["no-depth", "full"]) == 3
     rows = {(r["scene"], r["variant"]): r for r in read(tmp_path / "out")["runs"]}
     assert [r["status"] for r in rows.values()] == ["failed", "failed", "finished", "failed"]
-    assert "malformed JSON" in rows["bad", "full"]["error"] and rows["good", "no-guided"]["error"] == "out | of luck"
-    assert rows["good", "no-guided"]["psnr"] is None and rows["good", "full"]["psnr"] > 5
+    assert "malformed JSON" in rows["bad", "full"]["error"] and rows["good", "no-depth"]["error"] == "out | of luck"
+    assert rows["good", "no-depth"]["psnr"] is None and rows["good", "full"]["psnr"] > 5
     assert "out \\| of luck" in (tmp_path / "out" / "ablation.md").read_text()
     assert "out | of luck" in capsys.readouterr().err
 

@@ -18,6 +18,7 @@ from rgs_mi.settings import Density, Rates, Settings, Stage, Start, Weights
 from rgs_mi.shading import deferred
 from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.indirect import Indirect
+from rgs_mi.shading.split_sum import SplitSum
 from rgs_mi.surfel import Surfels
 from rgs_mi.views import Dataset, View
 
@@ -44,7 +45,7 @@ def dataset():
     views = []
     for k in range(6):
         camera = orbit_camera(k, size=(83, 75), distance=9.0)
-        image = deferred.render(truth, camera, deferred.Lighting(light.environment().filtered()))
+        image = deferred.render(truth, camera, deferred.Lighting(SplitSum(light.environment().filtered())))
         alpha = image.gbuffer.all.alpha.numpy().reshape(75, 83, 1)
         shown = losses.display(image.color, image.gbuffer.all.alpha, 0.0).numpy().T.reshape(75, 83, 3)
         straight = shown / np.maximum(alpha, 1e-3)
@@ -58,7 +59,7 @@ def test_crops_hold_the_object_and_their_cameras_fit(dataset, downscale):
     photographs = Photographs(dataset.train, downscale, 1.0)
     sizes = set()
     surfels = sphere_surfels(300, seed=2, scale=0.9, opacity_shift=4)
-    lighting = deferred.Lighting(model().environment().filtered())
+    lighting = deferred.Lighting(SplitSum(model().environment().filtered()))
     surfels = Surfels.from_numpy(surfels.numpy(), two_sided=False)
     for i, view in enumerate(dataset.train):
         photo = photographs[i]

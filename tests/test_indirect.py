@@ -14,6 +14,7 @@ from rgs_mi.proxies import Proxies
 from rgs_mi.shading import deferred
 from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.indirect import Indirect
+from rgs_mi.shading.split_sum import SplitSum
 from rgs_mi.surfel import CHANNELS, Surfels, rotation_from_normal
 
 from scenes import sphere_surfels
@@ -83,7 +84,8 @@ def image(surfels, kind, environment=None):
     """Linear radiance; ``kind``: of `Indirect`, None: without."""
     environment = environment or Environment(mi.TensorXf(np.full((16, 32, 3), LIGHT, np.float32)), np.eye(3))
     indirect = kind and Indirect(kind, Proxies(surfels), surfels)
-    return deferred.render(surfels, CAMERA, deferred.Lighting(environment.filtered(), indirect=indirect or None)).color
+    lighting = deferred.Lighting(SplitSum(environment.filtered()), indirect=indirect or None)
+    return deferred.render(surfels, CAMERA, lighting).color
 
 
 def array(color):

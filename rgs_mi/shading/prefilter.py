@@ -22,22 +22,24 @@ from ..aligned import lanes
 from .tables import lobe
 
 #: Roughness of each level and the most rows of its map; None: as the environment. Level 0 is the mirror: no filter.
+#: After them comes the diffuse lobe's.
 LEVELS = ((0.0, None), (0.1, 128), (0.2, 128), (0.3, 64), (0.4, 64), (0.55, 32), (0.7, 32), (0.85, 16), (1.0, 16))
+_DIFFUSE_ROWS = 16
 _NEGLIGIBLE = 1e-5  # rows where the lobe is below this part of its peak are left out
 _NODES_PER_LOBE = 2  # quadrature nodes per GGX width α = roughness² of a lobe
 
 
-def _kernel_matrix(roughness, rows, columns, out_rows):
-    """[M, out_rows, rows] of (5), M = frequencies of the output."""
+def _kernel_matrix(kernel_at, width, rows, columns, out_rows):
+    """[M, out_rows, rows] of (5) for K = ``kernel_at`` (angles in radians), ``width`` wide; M: frequencies of the output."""
     frequencies = min(columns, 2 * out_rows) // 2 + 1
-    nodes = max(2, int(np.ceil(np.pi / (rows - 1) / roughness**2 * _NODES_PER_LOBE)))  # per texel, in both directions
+    nodes = max(2, int(np.ceil(np.pi / (rows - 1) / width * _NODES_PER_LOBE)))  # per texel, in both directions
     fine = (rows - 1) * nodes + 1
     theta = np.linspace(0, np.pi, fine)
     samples = columns * nodes
     delta = 2 * np.pi * np.arange(samples // 2 + 1) / samples  # the kernel is even in Δφ
     # the lobe against its angle, dense where it is narrow
     angles = np.pi / 2 * np.linspace(0, 1, 4096) ** 2
-    table = lobe(roughness, angles)
+    table = kernel_at(angles)
     hat = np.maximum(0, 1 - np.abs(np.arange(fine)[:, None] / nodes - np.arange(rows)))  # [fine, rows]
     hat = (hat * np.sin(theta)[:, None]).astype(np.float32)
     theta_out = np.linspace(0, np.pi, out_rows)
@@ -122,11 +124,12 @@ class Prefilter:
 def prefilter(rows: int, columns: int, variant: str) -> Prefilter:
     """The operator for an environment of rows × columns texels; some seconds the first time. ``variant`` keys the cache."""
     maps, matrices = [(rows, columns)], []
-    for roughness, level_rows in LEVELS[1:]:
+    lobes = [(functools.partial(lobe, roughness), roughness**2, level_rows) for roughness, level_rows in LEVELS[1:]]
+    for kernel_at, width, level_rows in [*lobes, (np.cos, 1.0, _DIFFUSE_ROWS)]:
         out_rows = min(level_rows or rows, rows)
         out_columns = columns if out_rows == rows else 2 * out_rows
         maps.append((out_rows, out_columns))
-        matrices.append(_kernel_matrix(roughness, rows, columns, out_rows))
+        matrices.append(_kernel_matrix(kernel_at, width, rows, columns, out_rows))
     return Prefilter((rows, columns), tuple(maps), tuple(matrices))
 
 

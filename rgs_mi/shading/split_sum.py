@@ -1,20 +1,74 @@
 """The split-sum estimator of the specular integral: filtered environment × directional albedo, free of noise.
 
-    C_s ≈ P(d_o; roughness) · E(n·ω_o, roughness; metallic, base colour)
+    C_s ≈ Σ_k w_k P(d_k; r_k) · E(n·ω_o, roughness; metallic, base colour)
 
-with P the environment averaged over the BSDF's lobe (`prefilter.py`) and E its albedo (equation (4) of `tables.py`).
+with P the environment averaged over the BSDF's lobe seen along the normal (`prefilter.py`), a few of which make the lobe
+seen from elsewhere ((8) of `taps.py`), and E its albedo ((4) of `tables.py`).
 """
+
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from . import tables
+from .environment import FilteredEnvironment
+from .taps import taps
 
 DEFAULT_ETA = 1.5  # the principled BSDF's default, specular = 0.5
 
 
-def albedo(cosine, roughness, metallic, base_color, eta=DEFAULT_ETA):
-    """E of (4), ``mi.Color3f``: what the specular lobes reflect of a constant environment."""
+@dataclass
+class SplitSum:
+    """``environment``: filtered. ``eta``: index of refraction. ``entries``: a table of `taps` (None: the shipped one)."""
+
+    environment: FilteredEnvironment
+    eta: float = DEFAULT_ETA
+    entries: "mi.Float | None" = None
+
+    def specular(self, normal, view, roughness, metallic, base_color, cover=None):
+        """C_s, ``mi.Color3f``: radiance that the specular lobes of surfaces, one a lane, reflect towards ``view``.
+
+        ``normal``, ``view``: unit, world space, ``view`` from the surface to the camera. ``cover(radiance, direction,
+        lane)``: what comes along ``direction`` to the surface of ``lane`` (an index, None: of the same lane) where the
+        environment would bring ``radiance`` (None: that).
+        """
+        cosine = dr.dot(normal, view)
+        reflected = 2 * cosine * normal - view
+        E, phi = albedo(cosine, roughness, metallic, base_color, self.eta)
+        incoming = mi.Color3f(0)
+        for a, r, w in taps(cosine, roughness, phi, self.entries):
+            incoming += w * self.environment.eval(dr.normalize(reflected + a * normal), r)
+        if cover is not None:
+            incoming = cover(incoming, reflected, None)
+        return incoming * E
+
+    def diffuse(self, normal, view, roughness, metallic, base_color, cover=None):
+        """The same for the diffuse lobe, of which ``cover`` is not asked: it has no one direction."""
+        E = _table(dr.dot(normal, view), roughness, (3,), self.eta)[0]
+        return self.environment.eval_diffuse(normal) * E * (1 - metallic) * base_color
+
+    def seen_again(self) -> "SplitSum":
+        """The estimator of what a reflected ray meets."""
+        return self
+
+    def with_texels(self, texels) -> "SplitSum":
+        """The same with other ``texels`` of the environment."""
+        return replace(self, environment=replace(self.environment, texels=texels))
+
+
+def albedo(cosine, roughness, metallic, base_color, eta):
+    """(E of (4), ``mi.Color3f``: what the specular lobes reflect of a constant environment; φ, ``mi.Float``: the part of it
+    that Schlick's Fresnel term adds to a mirror of the constant colour F_0)."""
+    dielectric, black, white = _table(cosine, roughness, (0, 1, 2), eta)
+    E = (1 - metallic) * dielectric + metallic * (base_color * (white - black) + black)
+    mean = lambda color: (color.x + color.y + color.z) / 3  # dr.mean() would take that of all lanes
+    F_0 = dr.lerp(((eta - 1) / (eta + 1)) ** 2, mean(base_color), metallic)
+    return E, dr.clip(1 - F_0 * white / mean(E), 0, 1)
+
+
+def _table(cosine, roughness, columns, eta):
+    """Entries number ``columns`` of `tables.albedo_table`, interpolated, a list of ``mi.Float``."""
     table = tables.albedo_table(eta, mi.variant())
     entries = mi.Float(table.transpose(2, 0, 1).ravel())
     plane = tables.COSINES * tables.ROUGHNESSES
@@ -24,8 +78,9 @@ def albedo(cosine, roughness, metallic, base_color, eta=DEFAULT_ETA):
     column = dr.clip(mi.Int32(dr.detach(x)), 0, tables.ROUGHNESSES - 2)
     fy, fx = y - mi.Float(row), x - mi.Float(column)
     index = mi.UInt32(row * tables.ROUGHNESSES + column)
-    fetch = lambda i: mi.Vector3f(*[dr.gather(mi.Float, entries, i + k * plane) for k in range(3)])
-    value = dr.lerp(dr.lerp(fetch(index), fetch(index + 1), fx),
-                    dr.lerp(fetch(index + tables.ROUGHNESSES), fetch(index + tables.ROUGHNESSES + 1), fx), fy)
-    dielectric, black, white = value
-    return (1 - metallic) * dielectric + metallic * (base_color * (white - black) + black)
+    values = []
+    for k in columns:
+        fetch = lambda i: dr.gather(mi.Float, entries, i + k * plane)
+        values.append(dr.lerp(dr.lerp(fetch(index), fetch(index + 1), fx),
+                              dr.lerp(fetch(index + tables.ROUGHNESSES), fetch(index + tables.ROUGHNESSES + 1), fx), fy))
+    return values

@@ -5,8 +5,9 @@ With diffuse lobes off, the principled BSDF is linear in its Fresnel terms. For 
     E = (1 − m) E_dielectric + m (c (E_white − E_black) + E_black)                                 (4)
 
 where the three terms are the directional albedos of its dielectric (base colour 0), of a white metal and of a black
-metal (whose Schlick Fresnel term still rises to one at grazing angles). They depend on n·ω_o and roughness alone and are
-integrated here by evaluating the plugin itself; only the choice of sample directions is ours.
+metal (whose Schlick Fresnel term still rises to one at grazing angles), and its diffuse lobe reflects (1 − m) c E_diffuse.
+They depend on n·ω_o and roughness alone and are integrated here by evaluating the plugin itself; only the choice of sample
+directions is ours.
 """
 
 import functools
@@ -47,7 +48,7 @@ def interaction(wi):
 
 @functools.lru_cache(maxsize=4)
 def albedo_table(eta: float, variant: str) -> np.ndarray:
-    """[COSINES, ROUGHNESSES, 3] float32: (E_dielectric, E_black, E_white) of (4). ``variant`` keys the cache."""
+    """[COSINES, ROUGHNESSES, 4] float32: (E_dielectric, E_black, E_white) of (4), E_diffuse. ``variant`` keys the cache."""
     mu = np.maximum(cosine_nodes(), 1e-3)
     wi = mi.Vector3f(mi.Float(np.sqrt(1 - mu**2)), 0, mi.Float(mu))
     n = _SIDE * _SIDE
@@ -58,7 +59,8 @@ def albedo_table(eta: float, variant: str) -> np.ndarray:
     dr.eval(sample)
     wi = dr.gather(mi.Vector3f, wi, k // n)
     si = interaction(wi)
-    table = np.zeros((COSINES, ROUGHNESSES, 3), np.float32)
+    table = np.zeros((COSINES, ROUGHNESSES, 4), np.float32)
+    everywhere = mi.warp.square_to_cosine_hemisphere(sample)
     for column, roughness in enumerate(roughness_nodes()):
         alpha = dr.opaque(mi.Float, max(roughness, MIN_ROUGHNESS) ** 2)
         h, _ = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True).sample(wi, sample)
@@ -68,6 +70,9 @@ def albedo_table(eta: float, variant: str) -> np.ndarray:
         for row, (metallic, base_color) in enumerate([(0, 0), (1, 0), (1, 1)]):
             value = principled(float(roughness), metallic, base_color, eta).eval(mi.BSDFContext(), si, wo).x
             table[:, column, row] = dr.block_sum(dr.select(valid, value / pdf, 0), n).numpy() / n
+        white, black = (principled(float(roughness), 0, c, eta).eval(mi.BSDFContext(), si, everywhere).x for c in (1, 0))
+        value = (white - black) / mi.warp.square_to_cosine_hemisphere_pdf(everywhere)
+        table[:, column, 3] = dr.block_sum(value, n).numpy() / n
     return table
 
 

@@ -24,6 +24,10 @@ def pick(table: dict, name: str, what: str):
 @functools.cache
 def mesh(model: str, part: str):
     """The `meshes.Mesh` of one part of a model. Raises: UserError for an unknown model or part."""
+    return pick(parts(model), part, f"part of the model '{model}'")()
+
+
+def parts(model: str) -> dict:
+    """Name -> function that returns the `meshes.Mesh`, of all parts of a model. Raises: UserError for an unknown model."""
     pick(dict.fromkeys(MODELS), model, "model")
-    parts = importlib.import_module(f"{__name__}.{model}").PARTS
-    return pick(parts, part, f"part of the model '{model}'")()
+    return importlib.import_module(f"{__name__}.{model}").PARTS

@@ -1,0 +1,239 @@
+"""Our estimators of what a principled BSDF reflects, against Mitsuba's path tracer. What `scripts/crossvalidate.py` calls.
+
+The geometry is Mitsuba's own, and so are the rays: one through the centre of each pixel, traced by Mitsuba, for all. So what
+differs is the shading alone. A *case* is a shape of one material in an environment. For each:
+
+- the `path` integrator of two segments (direct light) is the truth of the BSDF's integral, and a deeper one tells what
+  interreflection adds; both are sampled in independent batches, whose spread gives the standard error of each pixel;
+- `monte_carlo`, in batches as well, must be equal to it: by the Z-test of `mitsuba.testing`, pixel by pixel, and over all
+  pixels together, where a small bias that no pixel shows adds up;
+- `split_sum` has an error of its own, Σ|difference| / Σ truth over all pixels, which is bounded.
+"""
+
+import itertools
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import stats
+
+from .camera import Camera
+from .shading.environment import Environment
+from .shading.monte_carlo import MonteCarlo
+from .shading.split_sum import DEFAULT_ETA, SplitSum
+
+ROUGHNESS = (0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0)
+METALS = ((0.95, 0.95, 0.95), (0.9, 0.6, 0.2))
+DIELECTRICS = ((0.0, 0.0, 0.0), (0.8, 0.8, 0.8), (0.1, 0.3, 0.7))  # without a diffuse lobe, and with one
+ENVIRONMENTS = ("studio", "kitchen", "city")
+BOUNDS = {"metal": 0.02, "dielectric": 0.03}  # of split_sum's error on a sphere
+BATCHES = 16
+SIGNIFICANCE, SUCCESS = 0.01, 0.975  # of the Z-test: of all pixels together, and the part of them that must pass
+GLOBAL = 4.5  # standard errors by which the sums over all pixels may differ
+_ENVIRONMENT_ROWS = 256
+_DEEP = 8
+
+
+@dataclass(frozen=True)
+class Case:
+    """``shape``: 'sphere' or a model of `targets`; ``environment``: of `targets.environments`."""
+
+    shape: str
+    environment: str
+    roughness: float
+    metallic: float
+    base_color: tuple[float, float, float]
+
+    @property
+    def kind(self):
+        return "metal" if self.metallic else "dielectric"
+
+    @property
+    def lit(self):
+        """Whether there is a diffuse lobe."""
+        return not self.metallic and any(self.base_color)
+
+
+def grid(shapes=("sphere",), environments=ENVIRONMENTS, roughness=ROUGHNESS) -> list[Case]:
+    """All cases: every shape, environment, material and roughness, the last fastest."""
+    materials = [(1.0, c) for c in METALS] + [(0.0, c) for c in DIELECTRICS]
+    return [Case(shape, environment, r, metallic, color)
+            for shape, environment, (metallic, color), r in itertools.product(shapes, environments, materials, roughness)]
+
+
+@dataclass
+class Estimate:
+    """``mean`` [pixels, 3] and ``variance`` [pixels, 3], that of the mean."""
+
+    mean: np.ndarray
+    variance: np.ndarray
+
+    @classmethod
+    def of(cls, batches) -> "Estimate":
+        """Of independent batches, [batches, pixels, 3]."""
+        return cls(np.mean(batches, 0), np.var(batches, 0, ddof=1) / len(batches))
+
+
+@dataclass
+class Result:
+    """What came out for a case, [pixels, 3] each, for the pixels ``lanes`` [pixels] that see the shape."""
+
+    case: Case
+    size: tuple[int, int]
+    lanes: np.ndarray
+    path: Estimate
+    deep: Estimate
+    monte_carlo: Estimate
+    split_sum: np.ndarray
+
+    @property
+    def z(self):
+        """Differences of monte_carlo and path in standard errors, [pixels, 3]."""
+        return (self.monte_carlo.mean - self.path.mean) / np.sqrt(self._variance())
+
+    @property
+    def passed(self) -> float:
+        """The part of all pixels and channels whose difference is no surprise among so many (Sidak's correction)."""
+        alpha = 1 - (1 - SIGNIFICANCE) ** (1 / len(self.lanes))
+        return float(np.mean(2 * stats.t.sf(np.abs(self.z), 2 * BATCHES - 2) > alpha))
+
+    @property
+    def global_z(self) -> float:
+        """The largest difference of sums over all pixels, of three channels, in standard errors."""
+        difference = (self.monte_carlo.mean - self.path.mean).sum(0)
+        return float(np.abs(difference / np.sqrt(self._variance().sum(0))).max())
+
+    def _variance(self):
+        # a pixel whose batches are all equal has no spread to judge by; rounding has
+        return self.monte_carlo.variance + self.path.variance + (1e-5 * np.abs(self.path.mean) + 1e-6) ** 2
+
+    @property
+    def error(self) -> float:
+        """Of split_sum: Σ|difference| / Σ truth."""
+        return _relative(self.split_sum, self.truth)
+
+    @property
+    def noise(self) -> float:
+        """The part of `error` that the truth's own noise makes."""
+        return float(np.sqrt(2 / np.pi * self.path.variance).sum() / self.path.mean.sum())
+
+    @property
+    def truth(self):
+        """The best estimate of the integral: where both agree, weighted by their variances."""
+        a, b = self.path.variance + 1e-12, self.monte_carlo.variance + 1e-12
+        return (self.path.mean * b + self.monte_carlo.mean * a) / (a + b)
+
+    @property
+    def interreflection(self) -> float:
+        """What more bounces add, relative to one."""
+        return float(self.deep.mean.sum() / self.path.mean.sum() - 1)
+
+    def failures(self) -> list[str]:
+        """What broke its bound, in words."""
+        found = []
+        if self.passed < SUCCESS:
+            found.append(f"monte_carlo differs from path in {1 - self.passed:.1%} of the pixels")
+        if self.global_z > GLOBAL:
+            found.append(f"monte_carlo differs from path by {self.global_z:.1f} standard errors over all pixels")
+        if self.case.shape == "sphere" and self.error > BOUNDS[self.case.kind]:
+            found.append(f"split_sum is off by {self.error:.2%} (bound: {BOUNDS[self.case.kind]:.0%})")
+        return found
+
+    def picture(self, values) -> np.ndarray:
+        """[H, W, 3] of values [pixels, 3], zero where the shape is not."""
+        width, height = self.size
+        image = np.zeros((height * width, 3), np.float32)
+        image[self.lanes] = values
+        return image.reshape(height, width, 3)
+
+
+def _relative(values, truth):
+    return float(np.abs(values - truth).sum() / truth.sum())
+
+
+class Validator:
+    """Compares cases with ``size`` pixels along a side, ``samples`` per pixel and batch of the path tracer's, and half as
+    many of ours, each of which is two."""
+
+    def __init__(self, size=64, samples=64, seed=0):
+        self.size, self.samples, self.seed = (size, size), samples, seed
+
+    def run(self, case: Case) -> Result:
+        """The estimates of one case."""
+        light = {"type": "procedural_envmap", "name": case.environment, "resolution": _ENVIRONMENT_ROWS,
+                 "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90)}
+        scene = mi.load_dict({"type": "scene", "light": light} | _shapes(case))
+        si, lanes, rays = self._hits(scene)
+        n = len(lanes)
+        view, normal = si.to_world(si.wi), mi.Vector3f(si.sh_frame.n)
+        surfaces = (normal, view, dr.opaque(mi.Float, case.roughness, n), dr.opaque(mi.Float, case.metallic, n),
+                    mi.Color3f(*(dr.opaque(mi.Float, c, n) for c in case.base_color)))
+        cover = None if case.shape == "sphere" else _Visibility(scene, si)
+        environment = Environment.from_emitter(scene.environment())
+
+        def sampled(seed):
+            estimator = MonteCarlo(environment.unfiltered(), scene.environment(), DEFAULT_ETA, max(self.samples // 2, 1),
+                                   dr.opaque(mi.UInt32, seed))
+            return _radiance(estimator, case, surfaces, cover)
+
+        batches = range(self.seed + 1, self.seed + 1 + BATCHES)
+        return Result(case, self.size, lanes,
+                      Estimate.of([self._path(scene, rays, 2, k) for k in batches]),
+                      Estimate.of([self._path(scene, rays, _DEEP, BATCHES + k) for k in batches]),
+                      Estimate.of([sampled(k) for k in batches]),
+                      _radiance(SplitSum(environment.filtered(), DEFAULT_ETA), case, surfaces, cover))
+
+    def _hits(self, scene):
+        """(surface interactions, their pixels [pixels], their rays) of a view of the shape."""
+        camera = Camera.look_at((2.6, 1.2, 1.1), (0, 0, 0), (0, 0, 1), 41.0, self.size)
+        directions = mi.Vector3f(camera.rays().reshape(-1, 3).T.astype(np.float32))
+        rays = mi.Ray3f(mi.Point3f(*camera.origin.tolist()), dr.normalize(directions))
+        si = scene.ray_intersect(rays)
+        lanes = dr.compress(si.is_valid() & (dr.dot(si.sh_frame.n, rays.d) < 0))
+        rays = mi.Ray3f(rays.o, dr.gather(mi.Vector3f, rays.d, lanes))
+        si = scene.ray_intersect(rays)
+        dr.eval(si, rays)
+        return si, lanes.numpy(), rays
+
+    def _path(self, scene, rays, depth, seed):
+        """[pixels, 3] radiance along ``rays`` as Mitsuba's `path` sees it."""
+        n = dr.width(rays)
+        pixel = dr.arange(mi.UInt32, n * self.samples) // self.samples
+        sampler = mi.load_dict({"type": "independent"})
+        sampler.seed(seed, n * self.samples)
+        integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 1000})
+        radiance, _, _ = integrator.sample(scene, sampler, mi.RayDifferential3f(dr.gather(mi.Ray3f, rays, pixel)))
+        return np.stack([dr.block_sum(c, self.samples).numpy() for c in radiance], -1) / self.samples
+
+
+class _Visibility:
+    """Light along a direction that the ``scene`` lets through."""
+
+    def __init__(self, scene, si):
+        self.scene, self.si = scene, si
+
+    def __call__(self, light, direction, lane):
+        si = self.si if lane is None else dr.gather(mi.SurfaceInteraction3f, self.si, lane)
+        return dr.select(self.scene.ray_test(si.spawn_ray(direction)), 0, light)
+
+
+def _shapes(case):
+    """The shape of a case for `mi.load_dict`."""
+    bsdf = {"type": "principled", "roughness": case.roughness, "metallic": case.metallic, "eta": DEFAULT_ETA,
+            "base_color": {"type": "rgb", "value": list(case.base_color)}}
+    if case.shape == "sphere":
+        return {"shape": {"type": "sphere", "bsdf": bsdf}}
+    from . import targets
+
+    return {part: {"type": "procedural_mesh", "model": case.shape, "part": part, "bsdf": bsdf}
+            for part in targets.parts(case.shape)}
+
+
+def _radiance(estimator, case, surfaces, cover):
+    """[pixels, 3] what ``estimator`` gives for ``surfaces``."""
+    with dr.suspend_grad():
+        radiance = estimator.specular(*surfaces, cover)
+        if case.lit:
+            radiance += estimator.diffuse(*surfaces, cover)
+        return radiance.numpy().T

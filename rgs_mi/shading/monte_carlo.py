@@ -1,0 +1,178 @@
+"""The Monte Carlo estimator of the reflected radiance: Mitsuba's own principled BSDF and emitter, sampled.
+
+    C = ∫ f(ω_i, ω_o) L(ω_i) |n·ω_i| dω_i ≈ 1/S Σ_s [ g(ω_s^b) + g(ω_s^l) ],   g = f L |n·ω_i| / (p_b + p_l)      (7)
+
+with one sample ω^b of the BSDF's lobe and one ω^l of the emitter in each of S: the balance heuristic (Veach 1997), written
+out. f is the specular or the diffuse part of the BSDF, which the plugin's linearity (4) tells apart:
+
+    f_specular = (1 − m) f(0, 0) + m f(1, c),   f_diffuse = (1 − m) (f(0, c) − f(0, 0))   for f(metallic, base colour).
+
+Derivatives are those of (7) itself with random numbers held: ω^b moves with normal and roughness, and everything in g
+follows, the densities too. Sampling by the lobe that moves keeps near-mirrors quiet, whose f has derivatives as large as its
+lobe is narrow, and since p_b + p_l depends on a sample only through its direction, both parts stay unbiased.
+"""
+
+import contextlib
+import functools
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from .environment import FilteredEnvironment
+from .tables import MIN_ROUGHNESS
+
+SAMPLES = 16  # a pixel, unless someone says otherwise
+#: Increments of the two-dimensional golden-ratio sequence (Roberts 2018), in units of 2⁻³²; a random offset a pixel makes
+#: each of its points uniform, and the points of a pixel fill the square evenly.
+_R2 = (3242174889, 2447445414)
+_LANES = 1 << 22  # samples at a time
+_OTHER, _DEEPER, _DIFFUSE = 0x9E3779B9, 0x85EBCA6B, 0xC2B2AE35  # what makes of a seed another
+
+
+@dataclass
+class MonteCarlo:
+    """``environment``: radiance, unfiltered. ``emitter``: Mitsuba's, whose sampling is used; it may be of a few steps ago,
+    which costs variance and no bias. ``eta``: index of refraction. ``samples``: S of (7). ``seed``: ``mi.UInt32``.
+    ``paired``: the derivatives are those of another, independent estimate than the value, as losses need that are not linear
+    in it.
+    """
+
+    environment: FilteredEnvironment
+    emitter: object
+    eta: float
+    samples: int
+    seed: "mi.UInt32"
+    paired: bool = False
+
+    def specular(self, normal, view, roughness, metallic, base_color, cover=None):
+        """C_s of (7), ``mi.Color3f``; see `SplitSum.specular`."""
+        return self._integral(_Specular, normal, view, roughness, metallic, base_color, cover)
+
+    def diffuse(self, normal, view, roughness, metallic, base_color, cover=None):
+        """C_d of (7), ``mi.Color3f``, where ``cover`` counts, too."""
+        other = replace(self, seed=self.seed ^ _DIFFUSE)
+        return other._integral(_Diffuse, normal, view, roughness, metallic, base_color, cover)
+
+    def seen_again(self) -> "MonteCarlo":
+        """The estimator of what a reflected ray meets: one sample is enough of what few rays see."""
+        return replace(self, samples=1, seed=self.seed ^ _DEEPER, paired=False)
+
+    def with_texels(self, texels) -> "MonteCarlo":
+        """The same with other ``texels`` of the environment."""
+        return replace(self, environment=replace(self.environment, texels=texels))
+
+    def _integral(self, lobe, *surfaces):
+        if self.paired:
+            derivatives = replace(self, paired=False)._integral(lobe, *surfaces)
+            with dr.suspend_grad():
+                value = replace(self, paired=False, seed=self.seed ^ _OTHER)._integral(lobe, *surfaces)
+            return dr.replace_grad(value, derivatives)
+        n = dr.width(surfaces[0])
+        each = max(1, min(self.samples, _LANES // n))
+        total = dr.zeros(mi.Color3f, n)
+        for first in range(0, self.samples, each):
+            total += self._sum(lobe, first, min(each, self.samples - first), *surfaces)
+        return total / self.samples
+
+    def _sum(self, lobe, first, count, normal, view, roughness, metallic, base_color, cover):
+        """Samples number ``first`` to ``first + count`` of (7), added."""
+        n = dr.width(normal)
+        index = dr.arange(mi.UInt32, n * count)
+        pixel, number = index // count, index % count + dr.opaque(mi.UInt32, first)
+        dr.eval(normal, view, roughness, metallic, base_color)
+        spread = lambda v: dr.gather(type(v), v, pixel)
+        material = lobe(spread(roughness), spread(metallic), spread(base_color), self.eta)
+        si = _interaction(spread(normal), spread(view))
+        rng = mi.PCG32(size=n, initstate=mi.UInt64(self.seed))
+        offsets = [[rng.next_uint32() for _ in _R2] for _ in range(2)]
+        dr.eval(offsets)
+        point = lambda k: mi.Point2f(*(_unit(dr.gather(mi.UInt32, o, pixel) + number * g) for o, g in zip(offsets[k], _R2)))
+        lit = self.emitter.sample_direction(si, point(0))[0].d
+        bounced = si.to_world(material.sample(si, point(1)))
+        total = mi.Color3f(0)
+        for direction in (dr.detach(lit), bounced):
+            local = si.to_local(direction)
+            light = self.environment.eval(direction)
+            if cover is not None:
+                light = cover(light, direction, pixel)
+            density = material.pdf(si, local) + self._emitter_pdf(si, direction)
+            g = material.eval(si, local) * light / density
+            total += dr.select((density > 0) & (local.z > 0), g, 0)
+        return mi.Color3f(*(dr.block_sum(c, count) for c in total))
+
+    def _emitter_pdf(self, si, direction):
+        ds = dr.zeros(mi.DirectionSample3f, dr.width(direction))
+        ds.d = direction
+        return self.emitter.pdf_direction(si, ds)
+
+
+@functools.lru_cache(maxsize=4)
+def _materials(eta: float, variant: str):
+    """Principled BSDFs that are black (a dielectric), metallic, and plastic, and the textures of the latter two: their
+    roughness, a lane each, and their base colour."""
+    roughness, color = mi.load_dict({"type": "lanes"}), mi.load_dict({"type": "lanes", "channels": 3})
+    bsdf = lambda metallic, base_color: mi.load_dict({"type": "principled", "eta": eta, "metallic": metallic,
+                                                      "base_color": base_color, "roughness": roughness})
+    return bsdf(0.0, {"type": "rgb", "value": 0.0}), bsdf(1.0, color), bsdf(0.0, color), roughness, color
+
+
+class _Lobe:
+    """Part of a principled BSDF, a material a lane: `eval` gives f |n·ω_i| for local directions, `sample` and `pdf` choose
+    them."""
+
+    def __init__(self, roughness, metallic, base_color, eta):
+        self.roughness, self.metallic, self.base_color, self.eta = roughness, metallic, base_color, eta
+        self.context = mi.BSDFContext()
+
+    @contextlib.contextmanager
+    def plugins(self):
+        """Mitsuba's BSDFs, black, metallic and plastic, with these materials for as long as the context lasts: others find
+        constants in them, which any kernel takes."""
+        *bsdfs, roughness, color = _materials(self.eta, mi.variant())
+        before = roughness.values, color.values
+        roughness.values, color.values = dr.maximum(self.roughness, MIN_ROUGHNESS), self.base_color
+        try:
+            yield bsdfs
+        finally:
+            roughness.values, color.values = before
+
+
+class _Specular(_Lobe):
+    """The metal's lobe is sampled; the dielectric's is as wide."""
+
+    def eval(self, si, local):
+        with self.plugins() as (black, metal, _):
+            return dr.lerp(black.eval(self.context, si, local), metal.eval(self.context, si, local), self.metallic)
+
+    def pdf(self, si, local):
+        with self.plugins() as (_, metal, _):
+            return metal.pdf(self.context, si, local)
+
+    def sample(self, si, point):
+        with self.plugins() as (_, metal, _):
+            return metal.sample(self.context, si, mi.Float(0.5), point)[0].wo
+
+
+class _Diffuse(_Lobe):
+    def eval(self, si, local):
+        with self.plugins() as (black, _, plastic):
+            return (1 - self.metallic) * (plastic.eval(self.context, si, local) - black.eval(self.context, si, local))
+
+    def pdf(self, si, local):
+        return mi.warp.square_to_cosine_hemisphere_pdf(local)
+
+    def sample(self, si, point):
+        return mi.warp.square_to_cosine_hemisphere(point)
+
+
+def _unit(x):
+    """``mi.UInt32`` as numbers in [0, 1)."""
+    return mi.Float(x >> 8) * 2**-24
+
+
+def _interaction(normal, view):
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(normal))
+    si.t, si.n, si.sh_frame = mi.Float(1), mi.Normal3f(normal), mi.Frame3f(normal)
+    si.wi = si.to_local(view)
+    return si

@@ -1,0 +1,57 @@
+"""Where split-sum looks the filtered environment up, so that a few isotropic lobes make the BSDF's own.
+
+Away from the normal a microfacet lobe is stretched, cut off at the horizon and moved off the mirror direction, and a Fresnel
+term that rises within it moves it further. Taps stand for it: lookups with weights w_k that add up to one, along
+
+    d_k = normalize(d_o + a_k n),   at roughness r_k = min(r exp(b_k), 1)                                          (8)
+
+d_o the mirror direction, n the normal. At n·ω_o = 1, where the filter's kernels are the BSDF's lobe itself, d_k = d_o.
+(a, b, log w) are tabled against n·ω_o, roughness and φ, the part of what is reflected that Schlick's Fresnel term adds to a
+mirror of constant colour. ``taps.npy`` was fitted to `monte_carlo` under random environments by `scripts/fit_taps.py`.
+"""
+
+import functools
+from importlib import resources
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..aligned import lanes
+
+FILE = "taps.npy"
+#: Rows are quadratic in the cosine; an entry is (a, b, log w, 0).
+COUNT, COSINES, ROUGHNESSES, FRACTIONS = SHAPE = (2, 10, 9, 2)
+
+
+@functools.lru_cache(maxsize=1)
+def shipped() -> np.ndarray:
+    """[*SHAPE, 4] float32: the table of this package."""
+    with (resources.files(__package__) / FILE).open("rb") as stream:
+        return np.load(stream, allow_pickle=False)
+
+
+@functools.lru_cache(maxsize=2)
+def _entries(variant):
+    return lanes(shipped())
+
+
+def taps(cosine, roughness, phi, entries=None) -> list:
+    """[(a, r_k, w)] of (8), a ``mi.Float`` each; ``entries``: a flat table of `SHAPE` (None: the shipped one)."""
+    if entries is None:
+        entries = _entries(mi.variant())
+    y = dr.sqrt(dr.clip(cosine, 1e-6, 1)) * (COSINES - 1)
+    x = dr.clip(roughness, 0, 1) * (ROUGHNESSES - 1)
+    row = dr.clip(mi.Int32(dr.detach(y)), 0, COSINES - 2)
+    column = dr.clip(mi.Int32(dr.detach(x)), 0, ROUGHNESSES - 2)
+    fy, fx = y - mi.Float(row), x - mi.Float(column)
+    first = mi.UInt32(row * ROUGHNESSES + column) * FRACTIONS
+    found = []
+    for k in range(COUNT):
+        fetch = lambda i: dr.gather(mi.Vector4f, entries, first + k * (COSINES * ROUGHNESSES * FRACTIONS) + i)
+        along = lambda i: dr.lerp(fetch(i), fetch(i + FRACTIONS), fx)
+        a, b, log_w, _ = dr.lerp(dr.lerp(along(0), along(ROUGHNESSES * FRACTIONS), fy),
+                                 dr.lerp(along(1), along(ROUGHNESSES * FRACTIONS + 1), fy), phi)
+        found.append((a, dr.minimum(roughness * dr.exp(b), 1), dr.exp(log_w)))
+    total = dr.rcp(sum(w for _, _, w in found))
+    return [(a, r, w * total) for a, r, w in found]
