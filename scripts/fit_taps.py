@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Fit where split-sum looks the environment up (``rgs_mi/shading/taps.npy``) to the Monte Carlo estimator; a minute or two."""
+"""Fit where split-sum looks the environment up (``rgs_mi/shading/taps.npy``) to the Monte Carlo estimator; minutes."""
 
 import argparse
 from pathlib import Path

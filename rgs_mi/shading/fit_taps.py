@@ -72,7 +72,7 @@ def relative_error(estimate, truth) -> float:
 
 
 def sampled(texels: np.ndarray, metallic: float, base_color: float, seed: int) -> Lanes:
-    """What random surfaces of all roughness, seen as those of spheres from afar, reflect of ``texels`` [rows, columns, 3]."""
+    """What random surfaces of all roughness, seen as a distant sphere's, reflect of ``texels`` [rows, columns, 3]."""
     rng = np.random.default_rng(seed)
     normal = _unit(rng.normal(size=(_LANES, 3)))
     across = rng.normal(size=(_LANES, 3))
