@@ -25,12 +25,12 @@ def write_exr(path, pixels: np.ndarray, channels=None):
         stream.write(memory.raw_buffer())
 
 
-def export(folder, scene, surfels, environment, specular, indirect, shader, views) -> list[Path]:
+def export(folder, scene, surfels, environment, shading, indirect, shader, views) -> list[Path]:
     """Write ``object.ply``, ``environment.exr``, ``shader.npz`` (where ``shader`` is not None, the identity) and
     ``scene.xml`` into ``folder`` and return their paths.
 
-    The scene is the one that was fitted (a `FitScene`) with the results in place of where the fit started, the estimator
-    ``specular``, ``indirect`` light, and a sensor for each of ``views``, whose id is the view's name:
+    The scene is the one that was fitted (a `FitScene`) with the results in place of where the fit started, its
+    ``shading``, ``indirect`` light, and a sensor for each of ``views``, whose id is the view's name:
     ``mi.render(mi.load_file("scene.xml"), sensor=i)``.
     Raises: UserError where the disk is full or the folder can't be written.
     """
@@ -39,8 +39,8 @@ def export(folder, scene, surfels, environment, specular, indirect, shader, view
     write_exr(folder / ENVIRONMENT, environment.texels.numpy())
     if shader:
         shader.save(folder / SHADER)
-    root = _fitted(scene, surfels, environment, {"specular": specular, "indirect": indirect,
-                                                   "shader": SHADER if shader else None})
+    root = _fitted(scene, surfels, environment, {"specular": shading.specular, "diffuse": shading.diffuse,
+                                                 "indirect": indirect, "shader": SHADER if shader else None})
     if any(abs(v.camera.focal[0] / v.camera.focal[1] - 1) > 1e-4 for v in views):
         warnings.warn(f"{folder / SCENE}: the cameras' pixels are not square, those of its sensors are", stacklevel=2)
     root.extend(_sensor(view) for view in views)

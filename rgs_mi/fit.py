@@ -1,6 +1,7 @@
 """The fit: views → render → loss → gradient → step → density, under a budget."""
 
 import time
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -14,9 +15,10 @@ from .model import ENVIRONMENT, SHADER, Model
 from .photographs import Photographs
 from .proxies import Proxies
 from .shading import deferred
+from .shading.deferred import Shading
 from .shading.indirect import Indirect
-from .shading.monte_carlo import SAMPLES, MonteCarlo
-from .shading.split_sum import DEFAULT_ETA, SplitSum
+from .shading.monte_carlo import MonteCarlo
+from .shading.split_sum import SplitSum
 from .surfel import CHANNELS, Surfels
 
 #: Rate of each parameter: the field of `Rates` that it obeys.
@@ -30,14 +32,15 @@ _DIVERGED = 10  # steps in a row without a finite error
 class Fit:
     """A fit in progress: the model, how far it is, and one method a step.
 
-    ``settings``: `Settings`. ``extent``: radius of the object in world units. ``specular``, ``eta``: how the scene is
-    shaded (see `FitScene`). ``priors``: a `DepthPrior` for each training view, or None. ``elapsed``: seconds spent so far,
+    ``settings``: `Settings`. ``extent``: radius of the object in world units. ``shading``: how the scene is.
+    ``priors``: a `DepthPrior` for each training view, or None. ``elapsed``: seconds spent so far,
     earlier sessions included.
     """
 
-    def __init__(self, dataset, model: Model, settings, extent: float, specular="split_sum", eta=DEFAULT_ETA, priors=None):
+    def __init__(self, dataset, model: Model, settings, extent: float, shading=Shading(), priors=None):
         self.dataset, self.model, self.settings, self.extent = dataset, model, settings, extent
-        self.specular, self.eta = "none" if settings.specular_start >= 1 else specular, eta
+        never = settings.specular_start >= 1
+        self.shading = replace(shading, specular="none", diffuse="radiance") if never else shading
         self.priors = priors
         self.step_number, self.views_used, self.elapsed = 0, 0, 0.0
         self.gradients = Gradients(len(model))
@@ -55,7 +58,7 @@ class Fit:
 
     @classmethod
     def resume(cls, dataset, settings, arrays: dict, meta: dict, **others) -> "Fit":
-        """The fit whose `state` this was. ``others``: ``specular``, ``eta``, ``priors``."""
+        """The fit whose `state` this was. ``others``: ``shading``, ``priors``."""
         fit = cls(dataset, Model.from_state(arrays), settings, meta["extent"], **others)
         fit.step_number, fit.views_used, fit.elapsed = meta["step"], meta["views_used"], meta["elapsed"]
         fit.gradients.sum, fit.gradients.count = (lanes(arrays[f"gradient_{k}"]) for k in ("sum", "count"))
@@ -82,8 +85,14 @@ class Fit:
 
     @property
     def _reflects(self):
-        """Whether reflections are shaded by now."""
-        return self.specular != "none" and self.progress >= self.settings.specular_start
+        """Whether reflections are shaded by now; without them nothing would be lit."""
+        begun = self._lit or self.progress >= self.settings.specular_start
+        return self.shading.specular != "none" and begun
+
+    @property
+    def _lit(self):
+        """Whether the light makes the diffuse radiance, too."""
+        return self.shading.diffuse == "lit"
 
     @property
     def _sees_itself(self):
@@ -99,21 +108,22 @@ class Fit:
         indirect = None
         if self._sees_itself:
             indirect = Indirect(self.settings.indirect, self.proxies if training else Proxies(surfels), surfels)
-        return deferred.Lighting(self._estimator(training), self.model.shader(), indirect)
+        return deferred.Lighting(self._estimator(training), self.model.shader(), indirect, self._lit)
 
     def _estimator(self, training):
         """Of the specular integral, by now."""
         environment, s = self.model.environment(), self.settings
         if not self._samples_light:
-            return SplitSum(environment.filtered(), self.eta)
+            return SplitSum(environment.filtered(), self.shading.eta)
         emitter = self.emitter if training else environment.emitter()
-        return MonteCarlo(environment.unfiltered(), emitter, self.eta, s.monte_carlo_samples if training else SAMPLES,
-                          dr.opaque(mi.UInt32, self.step_number), paired=training)
+        samples, seed = (s.monte_carlo_samples, self.step_number) if training else (self.shading.samples, 0)
+        return MonteCarlo(environment.unfiltered(), emitter, self.shading.eta, samples, dr.opaque(mi.UInt32, seed),
+                          paired=training)
 
     @property
     def _samples_light(self):
         """Whether the specular integral is sampled by now."""
-        return self.specular == "monte_carlo" and self.progress >= self.settings.monte_carlo_start
+        return self.shading.specular == "monte_carlo" and self.progress >= self.settings.monte_carlo_start
 
     def _refresh(self, surfels):
         """Rebuild what is used for many steps."""

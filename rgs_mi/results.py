@@ -32,7 +32,7 @@ def write(fit, scene, folder, quiet):
     background = fit.settings.background
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
-        exported = export(folder, scene, surfels, environment, fit.specular, fit.settings.indirect,
+        exported = export(folder, scene, surfels, environment, fit.shading, fit.settings.indirect,
                           fit.model.shader(), views)
         lighting = fit.lighting(surfels)
     scores, rows = {}, []

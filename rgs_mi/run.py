@@ -75,7 +75,7 @@ def start(scene, dataset, settings) -> Fit:
     light = scene.environment
     model = Model.start(positions, normals, colors, spacing, light.texels.numpy(), light.rotation, settings.sh_order,
                         settings.seed, settings.start.scale, settings.start.roughness, settings.shader)
-    return Fit(dataset, model, settings, extent, scene.specular, scene.eta, _priors(dataset, settings))
+    return Fit(dataset, model, settings, extent, scene.shading, _priors(dataset, settings))
 
 
 def _priors(dataset, settings):
@@ -97,8 +97,7 @@ def _resume(saved, scene, dataset, settings) -> Fit:
     if changed:
         listing = ", ".join(f"{key} {old.get(key)} -> {new[key]}" for key in changed)
         print(f"settings differ from the checkpoint's, the new ones hold: {listing}", file=sys.stderr)
-    return Fit.resume(dataset, settings, arrays, meta, specular=scene.specular, eta=scene.eta,
-                      priors=_priors(dataset, settings))
+    return Fit.resume(dataset, settings, arrays, meta, shading=scene.shading, priors=_priors(dataset, settings))
 
 
 def _photographs(dataset) -> list:

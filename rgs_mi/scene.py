@@ -9,6 +9,7 @@ from .config import load_config
 from .errors import UserError
 from .load import load_scene, surfels_of
 from .settings import Settings
+from .shading.deferred import Shading
 from .shading.environment import Environment
 from .truth import render_dataset
 from .views import Dataset, load_dataset
@@ -29,15 +30,14 @@ def _parse(path):
 class FitScene:
     """A scene to fit: the XML ``path`` and its ``root`` element, the ``variables`` it was loaded with, where its
     ``photographs`` are (a folder, or a scene to render them from), the ``environment`` to start from, and how it is
-    shaded: the integrator's ``specular`` and the index of refraction ``eta`` of the surfels."""
+    shaded."""
 
     path: Path
     root: ET.Element
     variables: dict
     photographs: Path
     environment: Environment
-    specular: str
-    eta: float
+    shading: Shading
 
     @classmethod
     def load(cls, path, data=None, variables=None) -> "FitScene":
@@ -63,7 +63,7 @@ class FitScene:
         if None in (cls.integrator_element(root), cls.surfels_element(root), cls.emitter_element(root)):
             raise UserError(f"{path}: integrator, surfels and environment must stand in this file, not in one it includes")
         return cls(path, root, variables, Path(surfels.photographs), Environment.from_emitter(scene.environment()),
-                   integrator.specular, surfels.eta)
+                   Shading(integrator.specular, integrator.diffuse, integrator.samples, surfels.eta))
 
     @staticmethod
     def integrator_element(root):

@@ -100,6 +100,8 @@ def test_indirect_light_is_exported(inputs, tmp_path):
 
 @pytest.mark.parametrize("old, new", [
     ('type="rgs_deferred">', 'type="rgs_deferred"><string name="specular" value="none"/>'),
+    ('type="rgs_deferred">', 'type="rgs_deferred"><string name="specular" value="monte_carlo"/>'),
+    ('type="rgs_deferred">', 'type="rgs_deferred"><string name="diffuse" value="lit"/>'),
     ('<bsdf type="principled" id="material"/>', '<bsdf type="principled"><float name="eta" value="2.5"/></bsdf>')])
 def test_shading_is_the_scenes(inputs, tmp_path, old, new):
     scene, data = inputs

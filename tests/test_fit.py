@@ -16,6 +16,7 @@ from rgs_mi.photographs import Photographs
 from rgs_mi.priors import DepthPrior
 from rgs_mi.settings import Density, Rates, Settings, Stage, Start, Weights
 from rgs_mi.shading import deferred
+from rgs_mi.shading.deferred import Shading
 from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.indirect import Indirect
 from rgs_mi.shading.split_sum import SplitSum
@@ -120,7 +121,21 @@ def test_specular_starts_late(dataset):
         fit.step()
         changed.append(not np.array_equal(before, fit.model.numpy("log_environment")))
     assert not any(changed[:19]) and changed[-1]
-    assert Fit(dataset, model(), replace(SETTINGS, specular_start=1.0), 1.0).specular == "none"
+    assert Fit(dataset, model(), replace(SETTINGS, specular_start=1.0), 1.0).shading.specular == "none"
+
+
+@pytest.mark.parametrize("shading", [Shading("monte_carlo"), Shading("monte_carlo", "lit"), Shading("split_sum", "lit")])
+def test_estimators_learn(dataset, shading):
+    """Each of them improves on a start with wrong roughness and colours; a fit that samples the light begins without."""
+    settings = replace(SETTINGS, iterations=60, monte_carlo_start=0.2, monte_carlo_samples=2)
+    fit, errors, kinds = Fit(dataset, model(), settings, 1.0, shading), [], []
+    while fit.progress < 1:
+        fit.step()
+        errors.append(fit.psnr)
+        kinds.append(type(fit.lighting(fit.model.surfels(0), training=True).estimator).__name__)
+    assert np.mean(errors[-6:]) > np.mean(errors[:6]) + 1
+    assert kinds[0] == "SplitSum" and kinds[-2] == ("MonteCarlo" if shading.specular == "monte_carlo" else "SplitSum")
+    assert dr.all(dr.isfinite(fit.model["log_environment"].array))
 
 
 def test_guided_surfels_need_half_the_gradient(dataset):
@@ -140,13 +155,13 @@ def test_guided_surfels_need_half_the_gradient(dataset):
 
 def test_without_specular_the_environment_stays(dataset, monkeypatch):
     monkeypatch.setattr(Environment, "filtered", None)  # nothing asks for it
-    fit = Fit(dataset, model(), SETTINGS, 1.0, specular="none")
+    fit = Fit(dataset, model(), SETTINGS, 1.0, shading=Shading("none"))
     before = {name: fit.model.numpy(name) for name in ("log_environment", "sh_dc", "centers")}
     for _ in range(10):
         fit.step()
     same = {name: np.array_equal(value, fit.model.numpy(name)) for name, value in before.items()}
     assert same == {"log_environment": True, "sh_dc": False, "centers": False}
-    again = Fit.resume(dataset, SETTINGS, *fit.state(), specular="none")
+    again = Fit.resume(dataset, SETTINGS, *fit.state(), shading=Shading("none"))
     again.step()
     assert np.isfinite(again.psnr)
 

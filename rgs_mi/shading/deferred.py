@@ -8,11 +8,21 @@ import mitsuba as mi
 from ..splat.gbuffer import render_gbuffer
 from ..splat.project import opaque
 from .indirect import Indirect
-from .monte_carlo import MonteCarlo
+from .monte_carlo import SAMPLES, MonteCarlo
 from .shader import Shader
-from .split_sum import SplitSum
+from .split_sum import DEFAULT_ETA, SplitSum
 
 COVERED = 4e-3  # pixels with less alpha are left empty
+
+
+@dataclass(frozen=True)
+class Shading:
+    """How a scene is shaded, as its integrator (see `rgs_deferred`) and its surfels say."""
+
+    specular: str = "split_sum"
+    diffuse: str = "radiance"
+    samples: int = SAMPLES
+    eta: float = DEFAULT_ETA
 
 
 @dataclass

@@ -47,12 +47,12 @@ class MonteCarlo:
 
     def specular(self, normal, view, roughness, metallic, base_color, cover=None):
         """C_s of (7), ``mi.Color3f``; see `SplitSum.specular`."""
-        return self._integral(_Specular, normal, view, roughness, metallic, base_color, cover)
+        return self._integral(SpecularLobe, normal, view, roughness, metallic, base_color, cover)
 
     def diffuse(self, normal, view, roughness, metallic, base_color, cover=None):
         """C_d of (7), ``mi.Color3f``, where ``cover`` counts, too."""
         other = replace(self, seed=self.seed ^ _DIFFUSE)
-        return other._integral(_Diffuse, normal, view, roughness, metallic, base_color, cover)
+        return other._integral(DiffuseLobe, normal, view, roughness, metallic, base_color, cover)
 
     def seen_again(self) -> "MonteCarlo":
         """The estimator of what a reflected ray meets: one sample is enough of what few rays see."""
@@ -81,7 +81,7 @@ class MonteCarlo:
         index = dr.arange(mi.UInt32, n * count)
         pixel, number = index // count, index % count + dr.opaque(mi.UInt32, first)
         dr.eval(normal, view, roughness, metallic, base_color)
-        spread = lambda v: dr.gather(type(v), v, pixel)
+        spread = lambda v: type(v)(*map(spread, v)) if dr.depth_v(v) > 1 else dr.custom(_Spread, v, count)
         material = lobe(spread(roughness), spread(metallic), spread(base_color), self.eta)
         si = _interaction(spread(normal), spread(view))
         rng = mi.PCG32(size=n, initstate=mi.UInt64(self.seed))
@@ -138,7 +138,7 @@ class _Lobe:
             roughness.values, color.values = before
 
 
-class _Specular(_Lobe):
+class SpecularLobe(_Lobe):
     """The metal's lobe is sampled; the dielectric's is as wide."""
 
     def eval(self, si, local):
@@ -154,7 +154,7 @@ class _Specular(_Lobe):
             return metal.sample(self.context, si, mi.Float(0.5), point)[0].wo
 
 
-class _Diffuse(_Lobe):
+class DiffuseLobe(_Lobe):
     def eval(self, si, local):
         with self.plugins() as (black, _, plastic):
             return (1 - self.metallic) * (plastic.eval(self.context, si, local) - black.eval(self.context, si, local))
@@ -164,6 +164,26 @@ class _Diffuse(_Lobe):
 
     def sample(self, si, point):
         return mi.warp.square_to_cosine_hemisphere(point)
+
+
+class _Spread(dr.CustomOp):
+    """Each entry ``count`` times in a row. (A gather's own derivative compiles the number of entries into its kernel.)"""
+
+    def eval(self, values, count):
+        self.count = count
+        return self._repeat(values)
+
+    def forward(self):
+        self.set_grad_out(self._repeat(self.grad_in("values")))
+
+    def backward(self):
+        self.set_grad_in("values", dr.block_sum(self.grad_out(), self.count))
+
+    def _repeat(self, values):
+        return dr.gather(mi.Float, values, dr.arange(mi.UInt32, dr.width(values) * self.count) // self.count)
+
+    def name(self):
+        return "rgs_mi.shading.Spread"
 
 
 def _unit(x):

@@ -1,4 +1,4 @@
-"""Our estimators of what a principled BSDF reflects, against Mitsuba's path tracer. What `scripts/crossvalidate.py` calls.
+"""Our estimators of what a principled BSDF reflects, against Mitsuba's path tracer.
 
 The geometry is Mitsuba's own, and so are the rays: one through the centre of each pixel, traced by Mitsuba, for all. So what
 differs is the shading alone. A *case* is a shape of one material in an environment. For each:
@@ -18,10 +18,13 @@ import mitsuba as mi
 import numpy as np
 from scipy import stats
 
-from .camera import Camera
-from .shading.environment import Environment
-from .shading.monte_carlo import MonteCarlo
-from .shading.split_sum import DEFAULT_ETA, SplitSum
+from .. import targets
+from ..camera import Camera
+from ..errors import UserError
+from ..shading.environment import Environment
+from ..shading.monte_carlo import MonteCarlo
+from ..shading.split_sum import DEFAULT_ETA, SplitSum
+from ..targets import environments as _suite
 
 ROUGHNESS = (0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0)
 METALS = ((0.95, 0.95, 0.95), (0.9, 0.6, 0.2))
@@ -46,6 +49,16 @@ class Case:
     base_color: tuple[float, float, float]
 
     @property
+    def material(self) -> str:
+        """In words."""
+        return f"{self.kind} {'/'.join(f'{c:g}' for c in self.base_color)}"
+
+    @property
+    def name(self) -> str:
+        """For files."""
+        return f"{self.shape}_{self.environment}_{self.material}_{self.roughness:g}".replace(" ", "_").replace("/", "-")
+
+    @property
     def kind(self):
         return "metal" if self.metallic else "dielectric"
 
@@ -56,7 +69,18 @@ class Case:
 
 
 def grid(shapes=("sphere",), environments=ENVIRONMENTS, roughness=ROUGHNESS) -> list[Case]:
-    """All cases: every shape, environment, material and roughness, the last fastest."""
+    """All cases: every shape, environment, material and roughness, the last fastest.
+
+    Raises: UserError for a shape or environment that does not exist, and for roughness out of [0, 1].
+    """
+    for shape in shapes:
+        if shape != "sphere":
+            targets.parts(shape)
+    for name in environments:
+        targets.pick(_suite.ENVIRONMENTS, name, "environment")
+    for r in roughness:
+        if not 0 <= r <= 1:
+            raise UserError(f"roughness is {r:g}: needs a number from 0 to 1")
     materials = [(1.0, c) for c in METALS] + [(0.0, c) for c in DIELECTRICS]
     return [Case(shape, environment, r, metallic, color)
             for shape, environment, (metallic, color), r in itertools.product(shapes, environments, materials, roughness)]
@@ -116,13 +140,19 @@ class Result:
     @property
     def noise(self) -> float:
         """The part of `error` that the truth's own noise makes."""
-        return float(np.sqrt(2 / np.pi * self.path.variance).sum() / self.path.mean.sum())
+        a, b = self._weights()
+        spread = np.sqrt(a**2 * self.path.variance + b**2 * self.monte_carlo.variance)
+        return float(np.sqrt(2 / np.pi) * spread.sum() / self.path.mean.sum())
 
     @property
     def truth(self):
-        """The best estimate of the integral: where both agree, weighted by their variances."""
-        a, b = self.path.variance + 1e-12, self.monte_carlo.variance + 1e-12
-        return (self.path.mean * b + self.monte_carlo.mean * a) / (a + b)
+        """The best estimate of the integral: both together, weighted by their variances over all pixels."""
+        a, b = self._weights()
+        return a * self.path.mean + b * self.monte_carlo.mean
+
+    def _weights(self):
+        a, b = self.path.variance.mean(), self.monte_carlo.variance.mean()
+        return (b / (a + b), a / (a + b)) if a + b > 0 else (0.5, 0.5)
 
     @property
     def interreflection(self) -> float:
@@ -154,9 +184,11 @@ def _relative(values, truth):
 
 class Validator:
     """Compares cases with ``size`` pixels along a side, ``samples`` per pixel and batch of the path tracer's, and half as
-    many of ours, each of which is two."""
+    many of ours, each of which is two. Raises: UserError where these are too few."""
 
     def __init__(self, size=64, samples=64, seed=0):
+        if size < 2 or samples < 2:
+            raise UserError(f"{size} pixels and {samples} samples are too few: needs at least 2 of both")
         self.size, self.samples, self.seed = (size, size), samples, seed
 
     def run(self, case: Case) -> Result:
@@ -224,8 +256,6 @@ def _shapes(case):
             "base_color": {"type": "rgb", "value": list(case.base_color)}}
     if case.shape == "sphere":
         return {"shape": {"type": "sphere", "bsdf": bsdf}}
-    from . import targets
-
     return {part: {"type": "procedural_mesh", "model": case.shape, "part": part, "bsdf": bsdf}
             for part in targets.parts(case.shape)}
 

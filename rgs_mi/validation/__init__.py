@@ -1,0 +1,1 @@
+"""Cross-validation of the estimators with Mitsuba's path tracer."""

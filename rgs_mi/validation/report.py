@@ -1,0 +1,109 @@
+"""What `scripts/crossvalidate.py` calls.
+
+    OUT/crossvalidation.html    everything on one page
+    OUT/cases.csv               a row a case
+    OUT/CASE.exr                float maps: path, monte_carlo, split_sum, z
+"""
+
+import csv
+import io
+import itertools
+import sys
+
+import numpy as np
+
+from .. import page
+from ..checkpoint import atomic_file
+from ..export import write_exr
+from ..pictures import tone_map
+from ..progress import Progress
+from .cases import BOUNDS, GLOBAL, SUCCESS
+from .checks import checks
+
+
+def crossvalidate(out, cases, validator, quiet=False, checked=(0.1, 0.3, 0.7)) -> int:
+    """Run ``cases`` and the checks for every roughness ``checked``, write what the module says into the folder ``out``,
+    print a summary and return how many bounds were broken."""
+    out.mkdir(parents=True, exist_ok=True)
+    results = []
+    with Progress(None, quiet, "comparing") as progress:
+        for k, case in enumerate(cases):
+            results.append(validator.run(case))
+            _write_maps(out / f"{case.name}.exr", results[-1])
+            progress.update((k + 1) / len(cases), cases=k + 1)
+    found = checks(checked)
+    rows = [_row(r) for r in results]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    for name, content in (("cases.csv", text.getvalue()), ("crossvalidation.html", _html(results, rows, found))):
+        with atomic_file(out / name) as stream:
+            stream.write(content.encode())
+    failures = [f"{r.case.name}: {words}" for r in results for words in r.failures()]
+    failures += [f"{c.name} is {c.value:.4g} (bound: {c.bound:g})" for c in found if not c.passed]
+    for line in failures:
+        print(line, file=sys.stderr)
+    equal = sum(r.passed >= SUCCESS and r.global_z <= GLOBAL for r in results)
+    print(f"monte_carlo equals path in {equal} of {len(results)} cases; split_sum is off by "
+          f"{np.mean([r.error for r in results]):.2%} in the mean, {max(r.error for r in results):.2%} at most; "
+          f"{sum(c.passed for c in found)} of {len(found)} checks pass\n{out / 'crossvalidation.html'}")
+    return len(failures)
+
+
+def _row(r) -> dict:
+    c = r.case
+    return {"shape": c.shape, "environment": c.environment, "material": c.material, "roughness": f"{c.roughness:g}",
+            "pixels": len(r.lanes), "z_passed": f"{r.passed:.4f}", "z_of_sums": f"{r.global_z:.2f}",
+            "split_sum_error": f"{r.error:.4f}", "noise": f"{r.noise:.4f}", "interreflection": f"{r.interreflection:+.4f}",
+            "verdict": "; ".join(r.failures()) or "passes"}
+
+
+def _write_maps(path, r):
+    maps = {"path": r.path.mean, "monte_carlo": r.monte_carlo.mean, "split_sum": r.split_sum, "z": r.z}
+    write_exr(path, np.concatenate([r.picture(v) for v in maps.values()], -1),
+              [f"{name}.{channel}" for name in maps for channel in "RGB"])
+
+
+def _html(results, rows, found) -> str:
+    parts = [page.paragraph(
+        "Mitsuba's path tracer (two segments: direct light) against rgs_deferred's estimators, on Mitsuba's geometry and "
+        "rays. z_passed: the part of all pixels whose difference to monte_carlo is within their standard errors; "
+        "z_of_sums: the difference of sums over all pixels in standard errors; split_sum_error: Σ|difference| / Σ truth, "
+        "of which noise is the truth's own; interreflection: what deeper paths add.")]
+    sphere = [r for r in results if r.case.shape == "sphere"]
+    if sphere:
+        series = {}
+        for r in sphere:
+            series.setdefault(r.case.material, {}).setdefault(r.case.roughness, []).append(100 * r.error)
+        series = {name: (sorted(values), [np.mean(values[x]) for x in sorted(values)]) for name, values in series.items()}
+        parts += [page.heading("Split-sum's error against roughness, sphere, mean over environments"),
+                  page.curves(series, "roughness", "%", {kind: 100 * b for kind, b in BOUNDS.items()})]
+    parts.append(page.heading("Cases"))
+    parts.append(page.table(list(rows[0]), [list(row.values()) for row in rows],
+                            [k for k, row in enumerate(rows) if row["verdict"] != "passes"]))
+    parts.append(page.heading("Sampler, reciprocity, energy"))
+    parts.append(page.table(("check", "value", "bound"), [(c.name, f"{c.value:.4g}", f"{c.bound:g}") for c in found],
+                            [k for k, c in enumerate(found) if not c.passed]))
+    parts.append(page.heading("Pictures"))
+    key = lambda r: (r.case.shape, r.case.environment, r.case.material)
+    for (shape, environment, material), group in itertools.groupby(results, key):
+        group = list(group)
+        columns = [_column(r) for r in group]
+        values = ", ".join(f"{r.case.roughness:g}" for r in group)
+        parts.append(page.figure(np.concatenate(columns, 1), f"{shape} in {environment}, {material}; roughness {values} "
+                                 "from left to right. Rows: path, monte_carlo, split_sum; z from −5 (blue) to 5 (red); "
+                                 "split_sum − truth from −0.2 to 0.2", 2))
+    return page.page("Cross-validation with Mitsuba's path tracer", *parts)
+
+
+def _column(r):
+    """The pictures of a case, one below the other."""
+    estimates = [tone_map(r.picture(v)) for v in (r.path.mean, r.monte_carlo.mean, r.split_sum)]
+    return np.concatenate([*estimates, _signed(r.picture(r.z) / 5), _signed(r.picture(r.split_sum - r.truth) * 5)])
+
+
+def _signed(values):
+    """[H, W, 3] in −1 … 1, the mean of channels, as blue to white to red."""
+    x = np.clip(values.mean(-1, keepdims=True), -1, 1)
+    return np.concatenate([1 + np.minimum(x, 0), 1 - np.abs(x), 1 - np.maximum(x, 0)], -1)
