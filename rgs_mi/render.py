@@ -1,5 +1,6 @@
 """Pictures of a fitted scene from its own views or from a turntable, through ``mi.load_file`` and ``mi.render``."""
 
+import sys
 from pathlib import Path
 
 import mitsuba as mi
@@ -12,12 +13,14 @@ from .export import SCENE, write_exr
 from .load import load_scene, surfels_of
 from .pictures import write_png
 from .progress import Progress
+from .relight import edit, relight
 from .shading.environment import Environment
 
 AOVS = ("albedo", "roughness", "metallic", "normal", "depth", "diffuse", "specular", "alpha")
 
 
-def render_scene(path, *, view=None, turntable=None, size=None, spp=1, out=None, aovs=False, quiet=False) -> list[Path]:
+def render_scene(path, *, view=None, turntable=None, size=None, spp=1, out=None, aovs=False, envmap=None, rotate=0.0,
+                 changes=(), quiet=False) -> list[Path]:
     """Render a scene of surfels into PNGs with straight alpha, and return their paths.
 
     Args:
@@ -29,6 +32,8 @@ def render_scene(path, *, view=None, turntable=None, size=None, spp=1, out=None,
       spp:       samples per pixel, a square number
       out:       a folder, or a PNG for a single view (default: ``renders`` or ``turntable`` beside the scene)
       aovs:      whether to write ``NAME.exr`` as well: radiance, alpha and the G-buffer, float32
+      envmap, rotate: another light, and the degrees by which light is turned (`relight`)
+      changes:   materials to set (`relight.edit`)
 
     Raises: UserError for bad input and where a file can't be written.
     """
@@ -37,6 +42,13 @@ def render_scene(path, *, view=None, turntable=None, size=None, spp=1, out=None,
     scene = load_scene(path, {})
     if not scene.sensors():
         raise UserError(f"{path}: has no sensors: nothing says where to look from")
+    if envmap is not None or rotate:
+        relight(scene, path, envmap, rotate)
+        if getattr(scene.integrator(), "diffuse", "lit") != "lit":
+            print(f"{path}: its diffuse radiance stays as photographed, only reflections change: "
+                  "fit with -D diffuse=lit to relight all of it", file=sys.stderr)
+    if changes:
+        edit(scene, path, changes)
     cameras = _circle(scene, path, turntable) if turntable else _view(scene, path, view)
     out = Path(out) if out else path.parent / ("turntable" if turntable else "renders")
     integrator = _integrator(scene, path) if aovs else scene.integrator()

@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Render a fitted scene from one of its views, or from a turntable."""
+"""Render a fitted scene from one of its views, or from a turntable; under another light or with another material."""
 
 import argparse
 from pathlib import Path
@@ -18,6 +18,11 @@ def main():
     parser.add_argument("--spp", type=int, default=1, help="samples per pixel, a square number (default: %(default)s)")
     parser.add_argument("--out", type=Path, metavar="FILE_OR_DIR", help="where to (default: a folder beside the scene)")
     parser.add_argument("--aovs", action="store_true", help="write the G-buffer as well, a multichannel EXR")
+    parser.add_argument("--envmap", metavar="FILE", help="light it by this image, latitude-longitude EXR or HDR, or by an "
+                        "environment of the suite, e.g. kitchen")
+    parser.add_argument("--rotate", type=float, default=0.0, metavar="DEG", help="turn the light about the vertical")
+    parser.add_argument("--set", dest="changes", action="append", default=[], metavar="NAME=VALUE",
+                        help="the material of all surfels: roughness, metallic or base_color")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
     parser.add_argument("--quiet", action="store_true", help="no progress")
     args = parser.parse_args()
@@ -26,7 +31,8 @@ def main():
     from rgs_mi.render import render_scene
 
     for path in render_scene(args.scene, view=args.view, turntable=args.turntable, size=args.size, spp=args.spp,
-                             out=args.out, aovs=args.aovs, quiet=args.quiet):
+                             out=args.out, aovs=args.aovs, envmap=args.envmap, rotate=args.rotate,
+                             changes=args.changes, quiet=args.quiet):
         print(path)
 
 
