@@ -51,14 +51,14 @@ def render_scene(path, *, view=None, turntable=None, size=None, spp=1, out=None,
         edit(scene, path, changes)
     cameras = _circle(scene, path, turntable) if turntable else _view(scene, path, view)
     out = Path(out) if out else path.parent / ("turntable" if turntable else "renders")
-    integrator = _integrator(scene, path) if aovs else scene.integrator()
+    integrator = with_aovs(scene, path) if aovs else scene.integrator()
     written = []
     with Progress(None, quiet or len(cameras) == 1, "rendering") as progress:
         for k, (name, camera) in enumerate(cameras.items()):
             if size:
                 camera = camera.resized(size, max(1, round(size * camera.size[1] / camera.size[0])))
             file = out if out.suffix == ".png" and not turntable else out / f"{name}.png"
-            image = np.array(mi.render(scene, sensor=_sensor(camera), integrator=integrator, spp=spp))
+            image = np.array(mi.render(scene, sensor=mi.load_dict(sensor_dict(camera)), integrator=integrator, spp=spp))
             write_png(file, straight(image))
             if aovs:
                 write_exr(file.with_suffix(".exr"), image, ["R", "G", "B", "A", *integrator.aov_names()])
@@ -73,10 +73,11 @@ def straight(image: np.ndarray) -> np.ndarray:
     return np.concatenate([srgb_encode(np.clip(image[..., :3] / np.maximum(alpha, 1e-6), 0, 1)), alpha], -1)
 
 
-def _sensor(camera):
+def sensor_dict(camera) -> dict:
+    """A sensor for `mi.load_dict`, with alpha."""
     sensor = camera.to_sensor_dict()
     sensor["film"]["pixel_format"] = "rgba"
-    return mi.load_dict(sensor)
+    return sensor
 
 
 def _view(scene, path, view):
@@ -111,8 +112,8 @@ def _circle(scene, path, frames):
     return circle
 
 
-def _integrator(scene, path):
-    """The scene's integrator with all its AOVs."""
+def with_aovs(scene, path):
+    """The scene's integrator with all its AOVs. Raises: UserError for one of another type."""
     own = scene.integrator()
     if not hasattr(own, "aov_names") or not hasattr(own, "specular"):
         raise UserError(f"{path}: maps come from the integrator 'rgs_deferred' only: leave out --aovs")
