@@ -81,9 +81,9 @@ class MonteCarlo:
         index = dr.arange(mi.UInt32, n * count)
         pixel, number = index // count, index % count + dr.opaque(mi.UInt32, first)
         dr.eval(normal, view, roughness, metallic, base_color)
-        spread = lambda v: type(v)(*map(spread, v)) if dr.depth_v(v) > 1 else dr.custom(_Spread, v, count)
-        material = lobe(spread(roughness), spread(metallic), spread(base_color), self.eta)
-        si = _interaction(spread(normal), spread(view))
+        normal, view, roughness, metallic, base_color = _spread((normal, view, roughness, metallic, base_color), count)
+        material = lobe(roughness, metallic, base_color, self.eta)
+        si = _interaction(normal, view)
         rng = mi.PCG32(size=n, initstate=mi.UInt64(self.seed))
         offsets = [[rng.next_uint32() for _ in _R2] for _ in range(2)]
         dr.eval(offsets)
@@ -99,6 +99,7 @@ class MonteCarlo:
             density = material.pdf(si, local) + self._emitter_pdf(si, direction)
             g = material.eval(si, local) * light / density
             total += dr.select((density > 0) & (local.z > 0), g, 0)
+        dr.eval(total)  # all channels in one kernel
         return mi.Color3f(*(dr.block_sum(c, count) for c in total))
 
     def _emitter_pdf(self, si, direction):
@@ -166,8 +167,17 @@ class DiffuseLobe(_Lobe):
         return mi.warp.square_to_cosine_hemisphere(point)
 
 
+def _spread(surfaces, count):
+    """``surfaces`` with each entry ``count`` times in a row. Single numbers, the same for all, stay as they are."""
+    columns = [c for v in surfaces for c in (v if dr.depth_v(v) > 1 else [v])]
+    wide = [c for c in columns if dr.width(c) > 1]
+    spread = iter(dr.custom(_Spread, wide, count) if wide else [])
+    columns = iter([next(spread) if dr.width(c) > 1 else c for c in columns])
+    return [type(v)(*(next(columns) for _ in v)) if dr.depth_v(v) > 1 else next(columns) for v in surfaces]
+
+
 class _Spread(dr.CustomOp):
-    """Each entry ``count`` times in a row. (A gather's own derivative compiles the number of entries into its kernel.)"""
+    """All at once: in the derivative they share one kernel, and a gather's own would compile their number into it."""
 
     def eval(self, values, count):
         self.count = count
@@ -177,10 +187,13 @@ class _Spread(dr.CustomOp):
         self.set_grad_out(self._repeat(self.grad_in("values")))
 
     def backward(self):
-        self.set_grad_in("values", dr.block_sum(self.grad_out(), self.count))
+        gradients = self.grad_out()
+        dr.eval(gradients)
+        self.set_grad_in("values", [dr.block_sum(g, self.count) for g in gradients])
 
     def _repeat(self, values):
-        return dr.gather(mi.Float, values, dr.arange(mi.UInt32, dr.width(values) * self.count) // self.count)
+        index = dr.arange(mi.UInt32, max(dr.width(v) for v in values) * self.count) // self.count
+        return [dr.gather(mi.Float, v, index) for v in values]
 
     def name(self):
         return "rgs_mi.shading.Spread"

@@ -25,13 +25,12 @@ def crossvalidate(out, cases, validator, quiet=False, checked=(0.1, 0.3, 0.7)) -
     """Run ``cases`` and the checks for every roughness ``checked``, write what the module says into the folder ``out``,
     print a summary and return how many bounds were broken."""
     out.mkdir(parents=True, exist_ok=True)
-    results = []
+    found, results = checks(checked), []
     with Progress(None, quiet, "comparing") as progress:
         for k, case in enumerate(cases):
             results.append(validator.run(case))
             _write_maps(out / f"{case.name}.exr", results[-1])
             progress.update((k + 1) / len(cases), cases=k + 1)
-    found = checks(checked)
     rows = [_row(r) for r in results]
     text = io.StringIO()
     writer = csv.DictWriter(text, rows[0], lineterminator="\n")
