@@ -8,6 +8,15 @@ class UserError(Exception):
     """Bad input. The message is one line: what is wrong, in which file, and what to do about it."""
 
 
+def listed(kind=str):
+    """The type of an option that is a list: 'a,b' to [kind('a'), kind('b')]."""
+    def parse(text):
+        return [kind(entry.strip()) for entry in text.split(",") if entry.strip()]
+
+    parse.__name__ = f"list of {kind.__name__}"  # what argparse calls a bad one
+    return parse
+
+
 def parse_variables(pairs: list[str]) -> dict[str, str]:
     """["name=value", …], as -D gives them, as a dictionary. Raises: UserError for a pair without '='."""
     if bad := [p for p in pairs if "=" not in p]:

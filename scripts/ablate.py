@@ -6,30 +6,22 @@ import argparse
 from pathlib import Path
 
 import rgs_mi
-from rgs_mi.errors import run_main
+from rgs_mi.errors import listed, run_main
 
 _SCENES = Path(__file__).parents[1] / "scenes"
-
-
-def names(text):
-    return [name.strip() for name in text.split(",") if name.strip()]
-
-
-def integers(text):
-    return [int(number) for number in text.split(",")]
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("suite", type=Path, nargs="?", default=_SCENES / "targets", metavar="SUITE",
                         help="a folder of scenes to path-trace, or of captures (default: scenes/targets)")
-    parser.add_argument("--scenes", type=names, metavar="A,B", help="these only")
-    parser.add_argument("--variants", type=names, metavar="A,B", help="these only: rows of the table in rgs_mi/ablate.py, "
-                        "or presets")
+    parser.add_argument("--scenes", type=listed(), metavar="A,B", help="these only")
+    parser.add_argument("--variants", type=listed(), metavar="A,B", help="these only: rows of the table in "
+                        "rgs_mi/ablate.py, or presets")
     parser.add_argument("--minutes", type=float, help="plan each fit to end within this time")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="A.B=VALUE",
                         help="one setting of all fits")
-    parser.add_argument("--seeds", "--seed", type=integers, default=[0],
+    parser.add_argument("--seeds", "--seed", type=listed(int), default=[0],
                         metavar="N,M", help="of everything random; fit with each of them (default: 0)")
     parser.add_argument("--out", type=Path, default=Path("runs") / "ablation", metavar="DIR",
                         help="folder of the tables and of all runs (default: %(default)s)")

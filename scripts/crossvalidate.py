@@ -5,23 +5,15 @@ import argparse
 from pathlib import Path
 
 import rgs_mi
-from rgs_mi.errors import run_main
-
-
-def names(text):
-    return [name.strip() for name in text.split(",") if name.strip()]
-
-
-def numbers(text):
-    return [float(number) for number in text.split(",")]
+from rgs_mi.errors import listed, run_main
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--shapes", type=names, default=["sphere"], metavar="A,B",
+    parser.add_argument("--shapes", type=listed(), default=["sphere"], metavar="A,B",
                         help="sphere, and models of the suite, e.g. helmet (default: sphere)")
-    parser.add_argument("--environments", type=names, metavar="A,B", help="of the suite (default: three)")
-    parser.add_argument("--roughness", type=numbers, metavar="R,S", help="of the materials (default: seven, 0.02 to 1)")
+    parser.add_argument("--environments", type=listed(), metavar="A,B", help="of the suite (default: three)")
+    parser.add_argument("--roughness", type=listed(float), metavar="R,S", help="of materials (default: seven, 0.02 to 1)")
     parser.add_argument("--size", type=int, default=64, help="pixels along a side (default: %(default)s)")
     parser.add_argument("--samples", type=int, default=128, help="per pixel, of each of 16 batches (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of everything random (default: %(default)s)")

@@ -6,11 +6,7 @@ import json
 from pathlib import Path
 
 import rgs_mi
-from rgs_mi.errors import run_main
-
-
-def names(text):
-    return [name.strip() for name in text.split(",") if name.strip()]
+from rgs_mi.errors import listed, run_main
 
 
 def main():
@@ -18,7 +14,7 @@ def main():
     parser.add_argument("run", type=Path, help="a run's folder")
     parser.add_argument("truth", type=Path, metavar="TRUTH.xml", help="the scene of its photographs, e.g. "
                         "scenes/targets/helmet.xml")
-    parser.add_argument("--lights", type=names, default=[], metavar="A,B", help="environments of the suite to relight it by")
+    parser.add_argument("--lights", type=listed(), default=[], metavar="A,B", help="environments of the suite to relight it")
     parser.add_argument("--size", type=int, default=400, help="pixels along a side of the path-traced views "
                         "(default: %(default)s)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to (default: recovery in the run's folder)")

@@ -127,7 +127,7 @@ def test_specular_starts_late(dataset):
 @pytest.mark.parametrize("shading", [Shading("monte_carlo"), Shading("monte_carlo", "lit"), Shading("split_sum", "lit")])
 def test_estimators_learn(dataset, shading):
     """Each of them improves on a start with wrong roughness and colours; a fit that samples the light begins without."""
-    settings = replace(SETTINGS, iterations=60, monte_carlo_start=0.2, monte_carlo_samples=2)
+    settings = replace(SETTINGS, iterations=40, monte_carlo_start=0.2, monte_carlo_samples=2)
     fit, errors, kinds = Fit(dataset, model(), settings, 1.0, shading), [], []
     while fit.progress < 1:
         fit.step()
