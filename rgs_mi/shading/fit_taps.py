@@ -17,7 +17,6 @@ from .taps import COUNT, SHAPE
 _ROWS = 256  # of the environments
 _LANES, _SAMPLES = 12_000, 1024
 _RATES = (0.03, 1e-3)  # first and last
-_LEAST_ROUGHNESS = 0.05
 #: What the taps are tabled for, at both ends of φ and between: (metallic, base colour).
 _MATERIALS = ((0.0, 0.0), (1.0, 1.0), (0.0, 0.0), (1.0, 0.5), (0.0, 0.0), (1.0, 0.95), (0.0, 0.0), (1.0, 0.2))
 
@@ -81,7 +80,7 @@ def sampled(texels: np.ndarray, metallic: float, base_color: float, seed: int) -
     view = np.sqrt(1 - sine**2) * normal + sine * across
     vector = lambda v: mi.Vector3f(lanes(v[:, 0]), lanes(v[:, 1]), lanes(v[:, 2]))
     constant = lambda v: lanes(np.full(_LANES, v))
-    surfaces = (vector(normal), vector(view), lanes(rng.uniform(_LEAST_ROUGHNESS, 1, _LANES)), constant(metallic),
+    surfaces = (vector(normal), vector(view), lanes(rng.uniform(0, 1, _LANES)), constant(metallic),
                 mi.Color3f(*3 * (constant(base_color),)))
     environment = Environment(mi.TensorXf(texels), np.eye(3))
     with dr.suspend_grad():

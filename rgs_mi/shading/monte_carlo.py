@@ -20,7 +20,6 @@ import drjit as dr
 import mitsuba as mi
 
 from .environment import FilteredEnvironment
-from .tables import MIN_ROUGHNESS
 
 SAMPLES = 16  # a pixel, unless someone says otherwise
 #: Increments of the two-dimensional golden-ratio sequence (Roberts 2018), in units of 2⁻³²; a random offset a pixel makes
@@ -132,7 +131,7 @@ class _Lobe:
         constants in them, which any kernel takes."""
         *bsdfs, roughness, color = _materials(self.eta, mi.variant())
         before = roughness.values, color.values
-        roughness.values, color.values = dr.maximum(self.roughness, MIN_ROUGHNESS), self.base_color
+        roughness.values, color.values = self.roughness, self.base_color
         try:
             yield bsdfs
         finally:

@@ -21,7 +21,7 @@ from ..aligned import lanes
 
 FILE = "taps.npy"
 #: Rows are quadratic in the cosine; an entry is (a, b, log w, 0).
-COUNT, COSINES, ROUGHNESSES, FRACTIONS = SHAPE = (2, 10, 9, 2)
+COUNT, COSINES, ROUGHNESSES, FRACTIONS = SHAPE = (3, 10, 9, 2)
 
 
 @functools.lru_cache(maxsize=1)
