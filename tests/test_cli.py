@@ -101,7 +101,7 @@ def test_indirect_light_is_exported(inputs, tmp_path):
 @pytest.mark.parametrize("old, new", [
     ('type="rgs_deferred">', 'type="rgs_deferred"><string name="specular" value="none"/>'),
     ('type="rgs_deferred">', 'type="rgs_deferred"><string name="specular" value="monte_carlo"/>'),
-    ('type="rgs_deferred">', 'type="rgs_deferred"><string name="diffuse" value="lit"/>'),
+    ('<default name="diffuse" value="radiance"/>', '<default name="diffuse" value="lit"/>'),
     ('<bsdf type="principled" id="material"/>', '<bsdf type="principled"><float name="eta" value="2.5"/></bsdf>')])
 def test_shading_is_the_scenes(inputs, tmp_path, old, new):
     scene, data = inputs
@@ -243,7 +243,8 @@ def test_mistakes(inputs, tmp_path):
         "malformed YAML": [scene, "--data", data, "--config", write("bad.yaml", "density: [1, ")],
         "did you mean": [scene, "--data", data, "--set", "densty.start=0.1"],
         "'flat' is a OrthographicCamera": [write("flat.xml", sensor), "--data", data],
-        "integrator is a": [write("path.xml", scene.read_text().replace("rgs_deferred", "path")), "--data", data],
+        "integrator is a": [write("path.xml", scene.read_text().replace("rgs_deferred", "path").replace(
+            '<string name="diffuse" value="$diffuse"/>', "")), "--data", data],
         "write name=value": [scene, "--data", data, "-D", "width"],
         "can't be written": [scene, "--data", data, "--out", scene / "run"],
     }
