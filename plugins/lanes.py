@@ -2,7 +2,7 @@
 Values of a wavefront as a texture (:monosp:`lanes`)
 -----------------------------------------------------
 
-Lane number *k* of an evaluation sees entry number *k* of ``value``, whatever the surface: so a BSDF of Mitsuba's can be
+Lane number *k* of an evaluation sees entry number *k* of ``values``, whatever the surface: so a BSDF of Mitsuba's can be
 evaluated for many materials at once, each lane its own. Set ``values`` before each evaluation; its width must be one or that
 of the evaluation. For code, not for scene files.
 

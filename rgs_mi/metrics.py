@@ -38,3 +38,8 @@ def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> 
     angle = 2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
     angle = np.where(np.linalg.norm(normal, axis=-1) > 0, angle, np.pi / 2)
     return float(np.degrees((weight * angle).sum() / weight.sum()))
+
+
+def relative_error(values, truth) -> float:
+    """Σ|difference| / Σ truth, of arrays of radiance of any one shape."""
+    return float(np.abs(values - truth).sum() / truth.sum())

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..aligned import lanes
 from ..checkpoint import atomic_file
+from ..metrics import relative_error
 from ..progress import Progress
 from .environment import Environment
 from .monte_carlo import MonteCarlo
@@ -60,14 +61,8 @@ def fit_taps(path, environments: int, steps: int, seed: int):
     with atomic_file(path) as stream:
         np.save(stream, optimizer["taps"].numpy().reshape(*SHAPE, 4))
     with dr.suspend_grad():
-        errors = [relative_error(some.estimate(optimizer["taps"]), some.truth) for some in held_out]
+        errors = [relative_error(some.estimate(optimizer["taps"]).numpy(), some.truth.numpy()) for some in held_out]
     print(f"{path}: error in environments that were held out {', '.join(f'{e:.2%}' for e in errors)}")
-
-
-def relative_error(estimate, truth) -> float:
-    """Σ|difference| / Σ truth, of ``mi.Color3f``."""
-    a, b = estimate.numpy(), truth.numpy()
-    return float(np.abs(a - b).sum() / b.sum())
 
 
 def sampled(texels: np.ndarray, metallic: float, base_color: float, seed: int) -> Lanes:

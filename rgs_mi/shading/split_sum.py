@@ -72,11 +72,7 @@ def _table(cosine, roughness, columns, eta):
     table = tables.albedo_table(eta, mi.variant())
     entries = mi.Float(table.transpose(2, 0, 1).ravel())
     plane = tables.COSINES * tables.ROUGHNESSES
-    y = dr.sqrt(dr.maximum(cosine, 1e-6)) * (tables.COSINES - 1)  # rows are quadratic in the cosine
-    x = dr.clip(roughness, 0, 1) * (tables.ROUGHNESSES - 1)
-    row = dr.clip(mi.Int32(dr.detach(y)), 0, tables.COSINES - 2)
-    column = dr.clip(mi.Int32(dr.detach(x)), 0, tables.ROUGHNESSES - 2)
-    fy, fx = y - mi.Float(row), x - mi.Float(column)
+    row, column, fy, fx = tables.cell(cosine, roughness, tables.COSINES, tables.ROUGHNESSES)
     index = mi.UInt32(row * tables.ROUGHNESSES + column)
     values = []
     for k in columns:

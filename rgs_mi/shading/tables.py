@@ -32,6 +32,16 @@ def roughness_nodes() -> np.ndarray:
     return np.linspace(0, 1, ROUGHNESSES)
 
 
+def cell(cosine, roughness, rows, columns):
+    """(row, column, f_row, f_column): the lower corner, ``mi.Int32``, of the cell that holds ``cosine`` and ``roughness`` in
+    a table of rows × columns over [0, 1]², rows quadratic in the cosine, and how far into the cell they are."""
+    y = dr.sqrt(dr.maximum(cosine, 1e-6)) * (rows - 1)
+    x = dr.clip(roughness, 0, 1) * (columns - 1)
+    row = dr.clip(mi.Int32(dr.detach(y)), 0, rows - 2)
+    column = dr.clip(mi.Int32(dr.detach(x)), 0, columns - 2)
+    return row, column, y - mi.Float(row), x - mi.Float(column)
+
+
 def principled(roughness: float, metallic: float, base_color: float, eta: float):
     """A stock principled BSDF with constant parameters."""
     return mi.load_dict({"type": "principled", "roughness": max(roughness, MIN_ROUGHNESS), "metallic": metallic, "eta": eta,

@@ -18,6 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..aligned import lanes
+from .tables import cell
 
 FILE = "taps.npy"
 #: Rows are quadratic in the cosine; an entry is (a, b, log w, 0).
@@ -40,11 +41,7 @@ def taps(cosine, roughness, phi, entries=None) -> list:
     """[(a, r_k, w)] of (8), a ``mi.Float`` each; ``entries``: a flat table of `SHAPE` (None: the shipped one)."""
     if entries is None:
         entries = _entries(mi.variant())
-    y = dr.sqrt(dr.clip(cosine, 1e-6, 1)) * (COSINES - 1)
-    x = dr.clip(roughness, 0, 1) * (ROUGHNESSES - 1)
-    row = dr.clip(mi.Int32(dr.detach(y)), 0, COSINES - 2)
-    column = dr.clip(mi.Int32(dr.detach(x)), 0, ROUGHNESSES - 2)
-    fy, fx = y - mi.Float(row), x - mi.Float(column)
+    row, column, fy, fx = cell(cosine, roughness, COSINES, ROUGHNESSES)
     first = mi.UInt32(row * ROUGHNESSES + column) * FRACTIONS
     found = []
     for k in range(COUNT):

@@ -21,6 +21,7 @@ from scipy import stats
 from .. import targets
 from ..camera import Camera
 from ..errors import UserError
+from ..metrics import relative_error
 from ..shading.environment import Environment
 from ..shading.monte_carlo import MonteCarlo
 from ..shading.split_sum import DEFAULT_ETA, SplitSum
@@ -135,7 +136,7 @@ class Result:
     @property
     def error(self) -> float:
         """Of split_sum: Σ|difference| / Σ truth."""
-        return _relative(self.split_sum, self.truth)
+        return relative_error(self.split_sum, self.truth)
 
     @property
     def noise(self) -> float:
@@ -176,10 +177,6 @@ class Result:
         image = np.zeros((height * width, 3), np.float32)
         image[self.lanes] = values
         return image.reshape(height, width, 3)
-
-
-def _relative(values, truth):
-    return float(np.abs(values - truth).sum() / truth.sum())
 
 
 class Validator:
