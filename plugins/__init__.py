@@ -6,7 +6,7 @@ import sys
 
 import mitsuba as mi
 
-_MODULES = ("procedural", "lanes", "surfels", "rgs_deferred")
+_MODULES = ("procedural", "lanes", "surfels", "rgs_deferred", "rgs_path")
 
 
 def _load(_old, new):

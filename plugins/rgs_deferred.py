@@ -69,9 +69,8 @@ from rgs_mi.shading.monte_carlo import SAMPLES, MonteCarlo
 from rgs_mi.shading.shader import Shader
 from rgs_mi.shading.split_sum import SplitSum
 from rgs_mi.splat.gbuffer import render_gbuffer
-from rgs_mi.surfel import CHANNELS
 
-from .surfels import SurfelShape, resolve
+from .surfels import resolve, surfels_in
 
 AOVS = {"depth": "T", "normal": "XYZ", "albedo": "RGB", "roughness": "Y", "metallic": "Y", "alpha": "Y",
         "specular": "RGB", "diffuse": "RGB"}
@@ -137,7 +136,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         """[height, width, channels] in the layout of the film's block: R, G, B, (alpha,) weight, AOVs."""
         width, height = camera.size
         camera = camera.resized(width * samples, height * samples)
-        surfels, eta = _surfels(scene)
+        surfels, eta = surfels_in(scene)
         environment = self._environment(scene)
         gbuffer = render_gbuffer(surfels, camera)
         maps = gbuffer.all
@@ -185,31 +184,6 @@ def _choice(props, name, default, choices):
     if value not in choices:
         raise UserError(f"rgs_deferred: unknown {name} '{value}': choose one of {', '.join(choices)}")
     return value
-
-
-def _surfels(scene):
-    """(all surfels of the scene as one, their index of refraction)."""
-    shapes = [shape for shape in scene.shapes() if isinstance(shape, SurfelShape) and len(shape.surfels)]
-    if not shapes:
-        raise UserError("rgs_deferred: the scene has no surfels: add a <shape type=\"surfels\"> with a 'filename'")
-    for name in ("eta", "two_sided"):
-        if len(values := {getattr(shape, name) for shape in shapes}) > 1:
-            raise UserError(f"rgs_deferred: shapes of surfels differ in '{name}' ({', '.join(map(str, values))})")
-    clouds = [shape.surfels for shape in shapes]
-    return clouds[0] if len(clouds) == 1 else _concatenate(clouds), shapes[0].eta
-
-
-def _concatenate(clouds):
-    """Several `Surfels` as one. Spherical harmonics of lower order are padded with zeros."""
-    channels = max(cloud.sh.shape[1] for cloud in clouds)
-
-    def column(cloud, name):
-        value = getattr(cloud, name)
-        missing = channels - value.shape[1] if name == "sh" else 0
-        return dr.concat((value, dr.zeros(mi.TensorXf, (len(cloud), missing))), axis=1) if missing else value
-
-    fields = {name: dr.concat([column(cloud, name) for cloud in clouds], axis=0) for name in CHANNELS}
-    return replace(clouds[0], **fields)
 
 
 def _aov(name, image, maps, camera, rays):

@@ -39,6 +39,8 @@ Tensors of another length may be assigned, which is how a fit adds and removes s
 ``bbox()`` is right, by means of one triangle of no area along its diagonal.
 """
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 
@@ -123,6 +125,34 @@ class SurfelShape(mi.Mesh):
 
     def to_string(self):
         return f"Surfels[id = {self.id()}, count = {len(self.surfels)}, proxies = {self.proxies}]"
+
+
+def surfels_in(scene):
+    """(all surfels of the scene as one `Surfels`, their index of refraction).
+
+    Raises: UserError where there are none, or they differ in what all have to share.
+    """
+    shapes = [shape for shape in scene.shapes() if isinstance(shape, SurfelShape) and len(shape.surfels)]
+    if not shapes:
+        raise UserError("the scene has no surfels: add a <shape type=\"surfels\"> with a 'filename'")
+    for name in ("eta", "two_sided"):
+        if len(values := {getattr(shape, name) for shape in shapes}) > 1:
+            raise UserError(f"shapes of surfels differ in '{name}' ({', '.join(map(str, values))})")
+    clouds = [shape.surfels for shape in shapes]
+    return clouds[0] if len(clouds) == 1 else _concatenate(clouds), shapes[0].eta
+
+
+def _concatenate(clouds):
+    """Several `Surfels` as one. Spherical harmonics of lower order are padded with zeros."""
+    channels = max(cloud.sh.shape[1] for cloud in clouds)
+
+    def column(cloud, name):
+        value = getattr(cloud, name)
+        missing = channels - value.shape[1] if name == "sh" else 0
+        return dr.concat((value, dr.zeros(mi.TensorXf, (len(cloud), missing))), axis=1) if missing else value
+
+    fields = {name: dr.concat([column(cloud, name) for cloud in clouds], axis=0) for name in CHANNELS}
+    return replace(clouds[0], **fields)
 
 
 def resolve(path: str) -> str:

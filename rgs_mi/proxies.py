@@ -32,18 +32,24 @@ def quads(corners):
 
 class Proxies:
     """Where the surfels were when this was built, for rays to meet: each as the quad in which its alpha exceeds a
-    threshold."""
+    ``solid`` threshold.
 
-    def __init__(self, surfels: Surfels):
+      scene      what rays meet: surfel number i is triangles 2 i and 2 i + 1
+      extent     half the width of each quad, in standard deviations, ``mi.Float``
+      normal     geometric normals, ``mi.Vector3f``
+      clearance  how far above the surface rays start, world units, ``mi.Float`` of width 1
+    """
+
+    def __init__(self, surfels: Surfels, solid=_SOLID):
         with dr.suspend_grad():
             opacity = surfels.column(mi.Float, "opacities")
-            extent = dr.sqrt(2 * dr.log(dr.maximum(opacity / _SOLID, 1)))
-            positions, faces = quads(corners(surfels, extent))
+            self.extent = dr.sqrt(2 * dr.log(dr.maximum(opacity / solid, 1)))
+            positions, faces = quads(corners(surfels, self.extent))
             self.normal = surfels.frames()[2]
             scale = surfels.column(mi.Vector2f, "scales")
             count = dr.opaque(mi.Float, len(surfels))  # dr.mean would compile it into a kernel
             self.clearance = _CLEARANCE * dr.sum(dr.minimum(scale.x, scale.y)) / count
-            dr.eval(positions, faces, self.normal, self.clearance)
+            dr.eval(positions, faces, self.extent, self.normal, self.clearance)
             mesh = mi.Mesh("proxies", 4 * len(surfels), 2 * len(surfels))
             params = mi.traverse(mesh)
             params["vertex_positions"], params["faces"] = positions, faces
@@ -62,3 +68,10 @@ class Proxies:
                 found &= dr.dot(dr.gather(mi.Vector3f, self.normal, number, found), ray.d) < 0
             dr.eval(found, number)
             return found, number
+
+    @staticmethod
+    def position(hit):
+        """(x, y) from −1 to 1 of a ray tracer's ``hit`` on its quad, along t_u and t_v."""
+        b_1, b_2 = hit.prim_uv
+        first = (hit.prim_index & 1) == 0  # of `_TRIANGLES`: the corners 0 1 2, then 0 2 3
+        return 2 * (dr.select(first, b_1 + b_2, b_1)) - 1, 2 * dr.select(first, b_2, b_1 + b_2) - 1

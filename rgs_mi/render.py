@@ -16,20 +16,22 @@ from .progress import Progress
 from .relight import edit, relight
 from .shading.environment import Environment
 
+_PASS = 16  # samples per pixel at a time
 AOVS = ("albedo", "roughness", "metallic", "normal", "depth", "diffuse", "specular", "alpha")
 
 
-def render_scene(path, *, view=None, turntable=None, size=None, spp=1, out=None, aovs=False, envmap=None, rotate=0.0,
-                 changes=(), quiet=False) -> list[Path]:
+def render_scene(path, *, variables=None, view=None, turntable=None, size=None, spp=1, out=None, aovs=False, envmap=None,
+                 rotate=0.0, changes=(), quiet=False) -> list[Path]:
     """Render a scene of surfels into PNGs with straight alpha, and return their paths.
 
     Args:
       path:      a run's folder, or a scene file
+      variables: of the scene, to override its defaults
       view:      a sensor, by its id or number (default: the first)
       turntable: instead of a view, that many frames of a camera that circles the object about the environment's
                  up axis, at the sensors' mean distance and elevation
       size:      width in pixels (default: the sensor's); the height follows
-      spp:       samples per pixel, a square number
+      spp:       samples per pixel; a square number for 'rgs_deferred'
       out:       a folder, or a PNG for a single view (default: ``renders`` or ``turntable`` beside the scene)
       aovs:      whether to write ``NAME.exr`` as well: radiance, alpha and the G-buffer, float32
       envmap, rotate: another light, and the degrees by which light is turned (`relight`)
@@ -39,7 +41,7 @@ def render_scene(path, *, view=None, turntable=None, size=None, spp=1, out=None,
     """
     path = Path(path)
     path = path / SCENE if path.is_dir() else path
-    scene = load_scene(path, {})
+    scene = load_scene(path, variables or {})
     if not scene.sensors():
         raise UserError(f"{path}: has no sensors: nothing says where to look from")
     if envmap is not None or rotate:
@@ -53,18 +55,29 @@ def render_scene(path, *, view=None, turntable=None, size=None, spp=1, out=None,
     out = Path(out) if out else path.parent / ("turntable" if turntable else "renders")
     integrator = with_aovs(scene, path) if aovs else scene.integrator()
     written = []
-    with Progress(None, quiet or len(cameras) == 1, "rendering") as progress:
+    with Progress(None, quiet or len(cameras) == 1 and spp <= _PASS, "rendering") as progress:
         for k, (name, camera) in enumerate(cameras.items()):
+            step = lambda part: progress.update((k + part) / len(cameras))
             if size:
                 camera = camera.resized(size, max(1, round(size * camera.size[1] / camera.size[0])))
             file = out if out.suffix == ".png" and not turntable else out / f"{name}.png"
-            image = np.array(mi.render(scene, sensor=mi.load_dict(sensor_dict(camera)), integrator=integrator, spp=spp))
+            image = _render(scene, mi.load_dict(sensor_dict(camera)), integrator, spp, step)
             write_png(file, straight(image))
             if aovs:
                 write_exr(file.with_suffix(".exr"), image, ["R", "G", "B", "A", *integrator.aov_names()])
             written.append(file)
-            progress.update((k + 1) / len(cameras))
     return written
+
+
+def _render(scene, sensor, integrator, spp, progress):
+    """[H, W, channels] in passes of `_PASS` samples, which bound memory; ``progress`` is told the part that is done. The
+    samples of `rgs_deferred` are a grid, and stay together."""
+    passes = [spp] if hasattr(integrator, "specular") else [_PASS] * (spp // _PASS) + [spp % _PASS] * (spp % _PASS > 0)
+    image = 0.0
+    for k, samples in enumerate(passes):
+        image += samples / spp * np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=samples, seed=k))
+        progress((k + 1) / len(passes))
+    return image
 
 
 def straight(image: np.ndarray) -> np.ndarray:

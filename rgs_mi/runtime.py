@@ -83,6 +83,8 @@ def set_variant(name: str = "llvm_ad_rgb"):
         mi.set_variant(name)
     except (ImportError, RuntimeError) as error:
         raise UserError(f"variant '{name}' does not run on this machine: {str(error).splitlines()[0]}") from error
+    if dr.thread_count() < 2:
+        dr.set_thread_count(2)  # on one core Mitsuba waits forever for an EXR file that it reads or writes (mitsuba3#21)
     if name.startswith("llvm") and dr.detail.llvm_version()[0] < MIN_LLVM:
         raise UserError(f"Dr.Jit had loaded LLVM {dr.detail.llvm_version()[0]} before rgs_mi could choose one: "
                         "import rgs_mi before drjit and mitsuba")

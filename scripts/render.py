@@ -5,17 +5,20 @@ import argparse
 from pathlib import Path
 
 import rgs_mi
-from rgs_mi.errors import run_main
+from rgs_mi.errors import parse_variables, run_main
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scene", type=Path, metavar="RUN_OR_SCENE.xml", help="a run's folder, or a scene")
+    parser.add_argument("-D", dest="define", action="append", default=[], metavar="NAME=VALUE",
+                        help="a variable of the scene")
     views = parser.add_mutually_exclusive_group()
     views.add_argument("--view", metavar="NAME|INDEX", help="a sensor of the scene (default: the first)")
     views.add_argument("--turntable", type=int, metavar="N", help="N frames around the object")
     parser.add_argument("--size", type=int, metavar="W", help="width in pixels (default: the sensor's)")
-    parser.add_argument("--spp", type=int, default=1, help="samples per pixel, a square number (default: %(default)s)")
+    parser.add_argument("--spp", type=int, default=1, help="samples per pixel; for surfels alone a square number "
+                        "(default: %(default)s)")
     parser.add_argument("--out", type=Path, metavar="FILE_OR_DIR", help="where to (default: a folder beside the scene)")
     parser.add_argument("--aovs", action="store_true", help="write the G-buffer as well, a multichannel EXR")
     parser.add_argument("--envmap", metavar="FILE", help="light it by this image, latitude-longitude EXR or HDR, or by an "
@@ -30,9 +33,9 @@ def main():
     rgs_mi.set_variant(args.variant)
     from rgs_mi.render import render_scene
 
-    for path in render_scene(args.scene, view=args.view, turntable=args.turntable, size=args.size, spp=args.spp,
-                             out=args.out, aovs=args.aovs, envmap=args.envmap, rotate=args.rotate,
-                             changes=args.changes, quiet=args.quiet):
+    for path in render_scene(args.scene, variables=parse_variables(args.define), view=args.view,
+                             turntable=args.turntable, size=args.size, spp=args.spp, out=args.out, aovs=args.aovs,
+                             envmap=args.envmap, rotate=args.rotate, changes=args.changes, quiet=args.quiet):
         print(path)
 
 

@@ -60,3 +60,13 @@ def test_a_wrong_library_ends_a_script_in_one_line(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert [line for line in done.stderr.splitlines() if line.startswith("error:")] == [done.stderr.splitlines()[-1]]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs a way to take cores away")
+def test_one_core_reads_and_writes_exr_files(tmp_path):
+    code = ("import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+            "import rgs_mi; rgs_mi.set_variant('llvm_ad_rgb')\n"
+            f"import mitsuba as mi, numpy as np; mi.Bitmap(np.ones((512, 512, 3), np.float32)).write(r'{tmp_path}/a.exr')\n"
+            f"print(np.array(mi.Bitmap(r'{tmp_path}/a.exr')).mean())")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "1.0", done.stderr

@@ -88,7 +88,7 @@ class MonteCarlo:
         dr.eval(offsets)
         point = lambda k: mi.Point2f(*(_unit(dr.gather(mi.UInt32, o, pixel) + number * g) for o, g in zip(offsets[k], _R2)))
         lit = self.emitter.sample_direction(si, point(0))[0].d
-        bounced = si.to_world(material.sample(si, point(1)))
+        bounced = si.to_world(material.sample(si, mi.Float(0.5), point(1)))
         total = mi.Color3f(0)
         for direction in (dr.detach(lit), bounced):
             local = si.to_local(direction)
@@ -118,8 +118,8 @@ def _materials(eta: float, variant: str):
 
 
 class _Lobe:
-    """Part of a principled BSDF, a material a lane: `eval` gives f |n·ω_i| for local directions, `sample` and `pdf` choose
-    them."""
+    """Part of a principled BSDF, a material a lane: `eval` gives f |n·ω_i| for local directions; `sample`, from a random
+    number and a point, and `pdf` choose them."""
 
     def __init__(self, roughness, metallic, base_color, eta):
         self.roughness, self.metallic, self.base_color, self.eta = roughness, metallic, base_color, eta
@@ -149,9 +149,9 @@ class SpecularLobe(_Lobe):
         with self.plugins() as (_, metal, _):
             return metal.pdf(self.context, si, local)
 
-    def sample(self, si, point):
+    def sample(self, si, choice, point):
         with self.plugins() as (_, metal, _):
-            return metal.sample(self.context, si, mi.Float(0.5), point)[0].wo
+            return metal.sample(self.context, si, choice, point)[0].wo
 
 
 class DiffuseLobe(_Lobe):
@@ -162,8 +162,27 @@ class DiffuseLobe(_Lobe):
     def pdf(self, si, local):
         return mi.warp.square_to_cosine_hemisphere_pdf(local)
 
-    def sample(self, si, point):
+    def sample(self, si, choice, point):
         return mi.warp.square_to_cosine_hemisphere(point)
+
+
+class WholeLobe(_Lobe):
+    """Both together: the principled BSDF itself, a mixture of metal and plastic."""
+
+    def eval(self, si, local):
+        with self.plugins() as (_, metal, plastic):
+            return dr.lerp(plastic.eval(self.context, si, local), metal.eval(self.context, si, local), self.metallic)
+
+    def pdf(self, si, local):
+        with self.plugins() as (_, metal, plastic):
+            return dr.lerp(plastic.pdf(self.context, si, local), metal.pdf(self.context, si, local), self.metallic)
+
+    def sample(self, si, choice, point):
+        of_metal = choice < self.metallic
+        choice = dr.select(of_metal, choice / self.metallic, (choice - self.metallic) / (1 - self.metallic))
+        with self.plugins() as (_, metal, plastic):
+            return dr.select(of_metal, metal.sample(self.context, si, choice, point)[0].wo,
+                             plastic.sample(self.context, si, choice, point)[0].wo)
 
 
 def _spread(surfaces, count):

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy import stats
 
 from .. import targets
 from ..camera import Camera
@@ -26,6 +25,7 @@ from ..shading.environment import Environment
 from ..shading.monte_carlo import MonteCarlo
 from ..shading.split_sum import DEFAULT_ETA, SplitSum
 from ..targets import environments as _suite
+from .statistics import GLOBAL, SUCCESS, Difference, Estimate
 
 ROUGHNESS = (0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0)
 METALS = ((0.95, 0.95, 0.95), (0.9, 0.6, 0.2))
@@ -33,8 +33,6 @@ DIELECTRICS = ((0.0, 0.0, 0.0), (0.8, 0.8, 0.8), (0.1, 0.3, 0.7))  # without a d
 ENVIRONMENTS = ("studio", "kitchen", "city")
 BOUNDS = {"metal": 0.02, "dielectric": 0.03}  # of split_sum's error on a sphere
 BATCHES = 16
-SIGNIFICANCE, SUCCESS = 0.01, 0.975  # of the Z-test: of all pixels together, and the part of them that must pass
-GLOBAL = 4.5  # standard errors by which the sums over all pixels may differ
 _ENVIRONMENT_ROWS = 256
 _DEEP = 8
 
@@ -88,19 +86,6 @@ def grid(shapes=("sphere",), environments=ENVIRONMENTS, roughness=ROUGHNESS) -> 
 
 
 @dataclass
-class Estimate:
-    """``mean`` [pixels, 3] and ``variance`` [pixels, 3], that of the mean."""
-
-    mean: np.ndarray
-    variance: np.ndarray
-
-    @classmethod
-    def of(cls, batches) -> "Estimate":
-        """Of independent batches, [batches, pixels, 3]."""
-        return cls(np.mean(batches, 0), np.var(batches, 0, ddof=1) / len(batches))
-
-
-@dataclass
 class Result:
     """What came out for a case, [pixels, 3] each, for the pixels ``lanes`` [pixels] that see the shape."""
 
@@ -113,25 +98,9 @@ class Result:
     split_sum: np.ndarray
 
     @property
-    def z(self):
-        """Differences of monte_carlo and path in standard errors, [pixels, 3]."""
-        return (self.monte_carlo.mean - self.path.mean) / np.sqrt(self._variance())
-
-    @property
-    def passed(self) -> float:
-        """The part of all pixels and channels whose difference is no surprise among so many (Sidak's correction)."""
-        alpha = 1 - (1 - SIGNIFICANCE) ** (1 / len(self.lanes))
-        return float(np.mean(2 * stats.t.sf(np.abs(self.z), 2 * BATCHES - 2) > alpha))
-
-    @property
-    def global_z(self) -> float:
-        """The largest difference of sums over all pixels, of three channels, in standard errors."""
-        difference = (self.monte_carlo.mean - self.path.mean).sum(0)
-        return float(np.abs(difference / np.sqrt(self._variance().sum(0))).max())
-
-    def _variance(self):
-        # a pixel whose batches are all equal has no spread to judge by; rounding has
-        return self.monte_carlo.variance + self.path.variance + (1e-5 * np.abs(self.path.mean) + 1e-6) ** 2
+    def difference(self) -> Difference:
+        """Of monte_carlo and path."""
+        return Difference(self.monte_carlo, self.path)
 
     @property
     def error(self) -> float:
@@ -163,10 +132,10 @@ class Result:
     def failures(self) -> list[str]:
         """What broke its bound, in words."""
         found = []
-        if self.passed < SUCCESS:
-            found.append(f"monte_carlo differs from path in {1 - self.passed:.1%} of the pixels")
-        if self.global_z > GLOBAL:
-            found.append(f"monte_carlo differs from path by {self.global_z:.1f} standard errors over all pixels")
+        if self.difference.passed < SUCCESS:
+            found.append(f"monte_carlo differs from path in {1 - self.difference.passed:.1%} of the pixels")
+        if self.difference.global_z > GLOBAL:
+            found.append(f"monte_carlo differs from path by {self.difference.global_z:.1f} standard errors over all pixels")
         if self.case.shape == "sphere" and self.error > BOUNDS[self.case.kind]:
             found.append(f"split_sum is off by {self.error:.2%} (bound: {BOUNDS[self.case.kind]:.0%})")
         return found

@@ -17,7 +17,7 @@ from ..checkpoint import atomic_file
 from ..export import write_exr
 from ..pictures import tone_map
 from ..progress import Progress
-from .cases import BOUNDS, GLOBAL, SUCCESS
+from .cases import BOUNDS
 from .checks import checks
 
 
@@ -43,7 +43,7 @@ def crossvalidate(out, cases, validator, quiet=False, checked=(0.1, 0.3, 0.7)) -
     failures += [f"{c.name} is {c.value:.4g} (bound: {c.bound:g})" for c in found if not c.passed]
     for line in failures:
         print(line, file=sys.stderr)
-    equal = sum(r.passed >= SUCCESS and r.global_z <= GLOBAL for r in results)
+    equal = sum(r.difference.equal for r in results)
     print(f"monte_carlo equals path in {equal} of {len(results)} cases; split_sum is off by "
           f"{np.mean([r.error for r in results]):.2%} in the mean, {max(r.error for r in results):.2%} at most; "
           f"{sum(c.passed for c in found)} of {len(found)} checks pass\n{out / 'crossvalidation.html'}")
@@ -53,13 +53,13 @@ def crossvalidate(out, cases, validator, quiet=False, checked=(0.1, 0.3, 0.7)) -
 def _row(r) -> dict:
     c = r.case
     return {"shape": c.shape, "environment": c.environment, "material": c.material, "roughness": f"{c.roughness:g}",
-            "pixels": len(r.lanes), "z_passed": f"{r.passed:.4f}", "z_of_sums": f"{r.global_z:.2f}",
+            "pixels": len(r.lanes), "z_passed": f"{r.difference.passed:.4f}", "z_of_sums": f"{r.difference.global_z:.2f}",
             "split_sum_error": f"{r.error:.4f}", "noise": f"{r.noise:.4f}", "interreflection": f"{r.interreflection:+.4f}",
             "verdict": "; ".join(r.failures()) or "passes"}
 
 
 def _write_maps(path, r):
-    maps = {"path": r.path.mean, "monte_carlo": r.monte_carlo.mean, "split_sum": r.split_sum, "z": r.z}
+    maps = {"path": r.path.mean, "monte_carlo": r.monte_carlo.mean, "split_sum": r.split_sum, "z": r.difference.z}
     write_exr(path, np.concatenate([r.picture(v) for v in maps.values()], -1),
               [f"{name}.{channel}" for name in maps for channel in "RGB"])
 
@@ -99,7 +99,8 @@ def _html(results, rows, found) -> str:
 def _column(r):
     """The pictures of a case, one below the other."""
     estimates = [tone_map(r.picture(v)) for v in (r.path.mean, r.monte_carlo.mean, r.split_sum)]
-    return np.concatenate([*estimates, _signed(r.picture(r.z) / 5), _signed(r.picture(r.split_sum - r.truth) * 5)])
+    return np.concatenate([*estimates, _signed(r.picture(r.difference.z) / 5),
+                           _signed(r.picture(r.split_sum - r.truth) * 5)])
 
 
 def _signed(values):
