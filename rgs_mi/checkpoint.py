@@ -96,6 +96,8 @@ def load_latest(folder) -> tuple[dict, dict] | None:
 
 def _load(path):
     with zipfile.ZipFile(path) as archive:
+        if max(info.file_size for info in archive.infolist()) > path.stat().st_size:
+            raise ValueError("it unpacks to more than it holds, and none of ours is compressed")
         meta = json.loads(archive.read("meta.json"))
         arrays = {}
         for name in archive.namelist():

@@ -9,12 +9,13 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from .checkpoint import atomic_file
-from .evaluate import SCORES, photograph
+from .evaluate import photograph
 from .pictures import crop, to_8bit
 
+SCORES = ("psnr", "ssim", "lpips", "normal_mae_deg")  # those of `evaluate.SCORES` that tables have room for
 FIGURES = (*SCORES, "surfels", "render_fps", "train_seconds")
 DETAILS = ("iterations", "peak_rss_mb")
-_HEADER = ("PSNR", "SSIM", "normals", "surfels", "views/s", "min")
+_HEADER = ("PSNR", "SSIM", "LPIPS", "normals", "surfels", "views/s", "min")
 _PANEL, _GAP, _MARGIN, _TEXT = 260, 8, 24, 20  # pixels of the picture
 _INK = (60, 60, 60)
 
@@ -53,9 +54,9 @@ def _mean(figures, names) -> dict:
 
 # ---- Tables ----
 
-_PLAIN = {"psnr": "{:.2f}", "ssim": "{:.4f}", "normal_mae_deg": "{:.2f}°", "surfels": "{:,.0f}", "render_fps": "{:.1f}",
-          "train_seconds": "{:.1f}", "peak_rss_mb": "{:.0f}"}
-_SIGNED = {"psnr": "{:+.2f}", "ssim": "{:+.4f}", "normal_mae_deg": "{:+.2f}°"}
+_PLAIN = {"psnr": "{:.2f}", "ssim": "{:.4f}", "lpips": "{:.4f}", "normal_mae_deg": "{:.2f}°", "surfels": "{:,.0f}",
+          "render_fps": "{:.1f}", "train_seconds": "{:.1f}", "peak_rss_mb": "{:.0f}"}
+_SIGNED = {"psnr": "{:+.2f}", "ssim": "{:+.4f}", "lpips": "{:+.4f}", "normal_mae_deg": "{:+.2f}°"}
 
 
 def _cell(name, value, format=_PLAIN):
@@ -71,7 +72,7 @@ def mean_tables(table, variants, published) -> str:
     for against in dict.fromkeys(variants[name].against for name in table):
         names = [name for name in table if variants[name].against == against]
         beside = any(name in published for name in names)
-        lines = [(f"Δ: to {variants[against].label}", "scenes", *_HEADER, "Δ PSNR", "Δ SSIM", "Δ normals",
+        lines = [(f"Δ: to {variants[against].label}", "scenes", *_HEADER, "Δ PSNR", "Δ SSIM", "Δ LPIPS", "Δ normals",
                   *(("paper: PSNR", "Δ", "SSIM", "normals", "surfels") if beside else ()))]
         for name in names:
             row = table[name]

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import drjit as dr
 import numpy as np
 
-from . import losses, metrics
+from . import losses, lpips, metrics
 from .color import display
 from .shading import deferred
 
 #: Figures of one view; the mean over views has the same names.
-SCORES = ("psnr", "ssim", "normal_mae_deg")
+SCORES = ("psnr", "ssim", "lpips", "lpips_alex", "normal_mae_deg", "normal_ssim", "normal_lpips")
 
 
 @dataclass
@@ -51,11 +51,30 @@ def photograph(view, background) -> np.ndarray:
 
 
 def score(view, rendering: Rendering, background) -> dict:
-    """The `SCORES` of one view; ``normal_mae_deg`` is None where the view has no normals."""
-    truth = photograph(view, background)
-    return {"psnr": metrics.psnr(rendering.image, truth), "ssim": metrics.ssim(rendering.image, truth),
-            "normal_mae_deg": None if view.normal is None
-            else _finite(metrics.normal_mae_deg(rendering.maps["normal"], view.normal, view.alpha))}
+    """The `SCORES` of one view. ``lpips`` and ``normal_lpips`` are with VGG16, as in the papers that build on 3DGS.
+
+    None: figures of normals where the view has none, and of LPIPS where its weights are not installed or the view is too
+    small for it. Normals are compared as pictures (`metrics.normal_colors`) that are white where the view's are unknown.
+    Raises: UserError where the weights are damaged.
+    """
+    distance = lpips.distance if lpips.installed() else lambda *_: float("nan")
+    pair = rendering.image, photograph(view, background)
+    figures = dict.fromkeys(SCORES) | {
+        "psnr": metrics.psnr(*pair), "ssim": metrics.ssim(*pair),
+        "lpips": _finite(distance(*pair, "vgg")), "lpips_alex": _finite(distance(*pair, "alex"))}
+    if view.normal is not None:
+        pair = _normal_pictures(view, rendering)
+        figures |= {"normal_mae_deg": _finite(metrics.normal_mae_deg(rendering.maps["normal"], view.normal, view.alpha)),
+                    "normal_ssim": metrics.ssim(*pair), "normal_lpips": _finite(distance(*pair, "vgg"))}
+    return figures
+
+
+def _normal_pictures(view, rendering):
+    """The normals of the rendering and the view's, [H, W, 3] each."""
+    unknown = (np.linalg.norm(view.normal, axis=-1) < 0.5) & (view.alpha > 0)
+    alphas = np.where(unknown, 0, [rendering.alpha[..., 0], view.alpha])
+    normals = np.where(unknown[..., None], 0, [rendering.maps["normal"], view.normal * view.alpha[..., None]])
+    return tuple(map(metrics.normal_colors, normals, alphas))
 
 
 def mean_scores(scores: list[dict]) -> dict:

@@ -40,6 +40,16 @@ def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> 
     return float(np.degrees((weight * angle).sum() / weight.sum()))
 
 
+def normal_colors(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    """[H, W, 3] colours in [0, 1] that show normals: n / 2 + 1/2, in world space, over white.
+
+    ``normal`` [H, W, 3] premultiplied by ``alpha`` [H, W]. What `ssim` and LPIPS of normals are of: the tables of the papers
+    give them of such pictures, without saying over which background.
+    """
+    alpha = np.asarray(alpha, np.float64)[..., None]
+    return np.clip((normal + alpha) / 2 + 1 - alpha, 0, 1)
+
+
 def relative_error(values, truth) -> float:
     """Σ|difference| / Σ truth, of arrays of radiance of any one shape."""
     return float(np.abs(values - truth).sum() / truth.sum())

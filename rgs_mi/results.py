@@ -11,14 +11,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import __version__, checkpoint, evaluate, pictures
+from . import __version__, checkpoint, evaluate, lpips, pictures
 from .config import to_dict
 from .export import export
 from .progress import Progress
 
 METRICS, SHEET, GUIDED = "metrics.json", "contact_sheet.png", "guided.png"
 SHOWN = 4  # test views on the sheet, and with their G-buffers written
-_NO_LPIPS = "not measured: this version has no LPIPS weights"
+_NO_LPIPS = f"not measured, for want of weights: {lpips.INSTALL}"
 
 
 def write(fit, scene, folder, quiet):
@@ -79,7 +79,8 @@ def _figures(fit, mean, fps) -> dict:
     """What metrics.json says of the run as a whole."""
     parameters = sum(fit.model.numpy(name).size for name in fit.model.optimizer.keys())
     return mean | {
-        "lpips": None, "lpips_reason": _NO_LPIPS,
+        "lpips_reason": None if mean["lpips"] is not None
+        else "not measured: no test views that are large enough" if lpips.installed() else _NO_LPIPS,
         "finished": fit.progress >= 1, "render_fps": fps, "train_seconds": fit.elapsed, "iterations": fit.step_number,
         "surfels": len(fit.model), "parameters": parameters,
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
@@ -101,6 +102,8 @@ def _summary(figures) -> list[str]:
         quality.append("no test views: nothing is held out to measure on")
     else:
         quality += [f"PSNR {figures['psnr']:.2f} dB", f"SSIM {figures['ssim']:.4f}"]
+    if figures["lpips"] is not None:
+        quality.append(f"LPIPS {figures['lpips']:.4f}")
     if figures["normal_mae_deg"] is not None:
         quality.append(f"normal error {figures['normal_mae_deg']:.2f}°")
     return [*quality, f"{figures['surfels']:,} surfels".replace(",", " "),

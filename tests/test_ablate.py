@@ -302,10 +302,10 @@ def test_means():
     text = comparison.mean_tables(table, ablate.VARIANTS, ablate.PAPER)
     cells = [[cell.strip() for cell in line.split("|")] for line in text.splitlines() if line]
     lines = {line[1]: line[2:-1] for line in cells}
-    assert lines["full: + CSCR + RD"] == ["2", "27.75", "", "2.75°", "", "", "", "+2.25 (+2.00, +4.00)", "",
+    assert lines["full: + CSCR + RD"] == ["2", "27.75", "", "", "2.75°", "", "", "", "+2.25 (+2.00, +4.00)", "", "",
                                           "-2.50° (-3.00°, -2.00°)", "35.38", "+2.09", "0.976", "2.04°", "100 000"]
     assert lines["deferred 2DGS"][-5:] == ["33.29", "", "0.967", "", "1 400 000"]
-    assert lines["full, no depth prior"] == ["1", "22.00", "", "7.00°", "", "", "", "-1.00", "", "+2.00°"]
+    assert lines["full, no depth prior"] == ["1", "22.00", "", "", "7.00°", "", "", "", "-1.00", "", "", "+2.00°"]
     assert len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1  # aligned
 
 

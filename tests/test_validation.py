@@ -45,9 +45,9 @@ def test_a_wrong_lobe_is_found(monkeypatch):
     """Sampled more widely than its density says."""
     sample = SpecularLobe.sample
 
-    def wide(self, si, point):
+    def wide(self, si, choice, point):
         self.roughness = self.roughness * 1.1
-        return sample(self, si, point)
+        return sample(self, si, choice, point)
 
     monkeypatch.setattr(SpecularLobe, "sample", wide)
     result = Validator(16, 128).run(METAL)

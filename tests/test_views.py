@@ -8,6 +8,7 @@ import zlib
 
 import numpy as np
 import pytest
+from captures import write_exr
 from PIL import Image
 
 from rgs_mi.errors import UserError
@@ -106,13 +107,6 @@ def test_16_bit_colour(tmp_path):
     np.testing.assert_array_equal(only(tmp_path).pixels, np.full((2, 3, 4), [0x12, 0x80, 0xff, 0xff]))
 
 
-def write_exr(path, rgb, alpha=None):
-    import OpenEXR
-
-    channels = {"RGB": rgb} if alpha is None else {"RGBA": np.concatenate([rgb, alpha], -1)}
-    OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(path))
-
-
 def test_exr_is_linear_with_straight_alpha(tmp_path):
     write(tmp_path, [frame("a.exr")])
     alpha = np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4, 1)
@@ -161,6 +155,26 @@ def test_clamped_normals_are_used_only_where_nothing_was_lost(tmp_path):
     normal, inside = load_dataset(tmp_path).test[0].normal, disc()[..., 3] > 0
     np.testing.assert_allclose(normal[:, :12][inside[:, :12]][0], [0, 0.6, 0.8], atol=5e-3)
     assert (normal[:, 12:] == 0).all()
+
+
+def test_alpha_beside_the_photograph(tmp_path):
+    """Shiny Blender's companions: an alpha counts where the photograph has none, a disparity never."""
+    alpha = disc()[..., 3]
+    write(tmp_path, [frame("a"), frame("b"), frame("c")], images={
+        "a.png": disc()[..., :3], "a_alpha.png": alpha // 2, "b.png": disc(), "b_alpha.png": 255 - alpha,
+        "c.png": np.dstack([disc()[..., :3], np.full((16, 24), 255, np.uint8)]), "c_alpha.png": np.dstack([alpha] * 3)})
+    (tmp_path / "train/a_disp.tiff").write_bytes(b"never read")
+    a, b, c = load_dataset(tmp_path).train
+    np.testing.assert_array_equal(a.pixels, np.dstack([disc()[..., :3], alpha // 2]))
+    for view in (b, c):
+        np.testing.assert_array_equal(view.pixels[..., 3], alpha)
+    assert a.masked and b.masked and c.masked
+    Image.fromarray(np.full((8, 12), 255, np.uint8)).save(tmp_path / "train/a_alpha.png")
+    view = load_dataset(tmp_path).train[0]
+    assert not view.masked and (view.pixels[..., 3] == 255).all()
+    (tmp_path / "train/a_alpha.png").write_bytes(b"damaged")
+    with pytest.raises(UserError, match="frame 0: .*a_alpha.png cannot be read as an image"):
+        load_dataset(tmp_path)
 
 
 # ---- What goes wrong ----
@@ -239,7 +253,7 @@ def test_bad_intrinsics(tmp_path, meta, message):
 def test_frames_without_a_pose_or_with_one_name(tmp_path):
     with pytest.raises(UserError, match='frame 1: "transform_matrix" is missing'):
         load_dataset(write(tmp_path, [frame("a"), {"file_path": "train/b"}]))
-    with pytest.raises(UserError, match="frame 1 has the same file name as frame 0"):
+    with pytest.raises(UserError, match="frame 1 has the same file name as .*frame 0"):
         load_dataset(write(tmp_path, [frame("a"), frame("a")]))
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import UserError
+from ..views.images import MAX_PIXELS, check_size
 from .maps import DepthPrior, outlined, resize
 
 _ASPECT = 0.05  # how far proportions may be off: estimators round sizes to multiples of 14 or 32
@@ -67,6 +68,8 @@ def _read_npz(path):
     with np.load(path, allow_pickle=False) as arrays:
         if "depth" not in arrays and len(arrays) != 1:
             raise ValueError(f"none of its arrays ({', '.join(arrays) or 'it has none'}) is called 'depth'")
+        if max(info.file_size for info in arrays.zip.infolist()) > 16 * MAX_PIXELS:
+            raise ValueError("its arrays are too large")
         return arrays["depth" if "depth" in arrays else arrays.files[0]]
 
 
@@ -79,6 +82,9 @@ def _read_exr(path):
     """The channel called depth, Depth.Z (of any layer), Z or Y, upper or lower case; else the first that is not alpha."""
     import OpenEXR
 
+    with OpenEXR.File(str(path), header_only=True) as file:
+        lower, upper = file.header()["dataWindow"]
+        check_size(int(upper[0]) - int(lower[0]) + 1, int(upper[1]) - int(lower[1]) + 1)
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {name: channel.pixels for name, channel in file.channels().items()}
 
@@ -94,6 +100,7 @@ def _read_png(path):
     from PIL import Image
 
     with Image.open(path, formats=("PNG",)) as image:
+        check_size(*image.size)
         if not image.mode.startswith("I"):
             raise ValueError(f"its mode is {image.mode}, and 16-bit grey is needed: 8 bits are too few for depth")
         values = np.asarray(image).astype(np.float32)

@@ -81,7 +81,7 @@ def _chi2(roughness) -> float:
 
     def draw(points):
         lobe, si = lanes(dr.width(points))
-        local = lobe.sample(si, points)
+        local = lobe.sample(si, mi.Float(0.5), points)
         return local, dr.select(local.z > 0, mi.Float(1), 0)  # below the horizon nothing is reflected
 
     def density(local):

@@ -50,15 +50,19 @@ class Dataset:
 
 
 def load_dataset(root: Path) -> Dataset:
-    """Load the capture in folder ``root``, whatever known layout it has.
+    """Load the capture in folder ``root``, in the first layout that it has: `blender`, `nerfstudio`, `colmap`, `nero`.
 
+    World and cameras stay as in the files. Photographs of lenses with distortion are made those of pinholes
+    (`distortion.undistorted`, which keeps them below the current folder).
     Raises: UserError when the folder is missing, has no known layout, or when a file in it is bad.
     """
-    from . import blender
+    from . import blender, colmap, nerfstudio, nero
 
-    root = Path(root)
+    root, layouts = Path(root), (blender, nerfstudio, colmap, nero)
     if not root.is_dir():
         raise UserError(f"data folder '{root}' does not exist: give a capture's folder with --data")
-    if (root / blender.TRAIN).is_file():
-        return blender.load(root)
-    raise UserError(f"data folder '{root}' has no layout that is known: looked for {blender.TRAIN} (Blender)")
+    for layout in layouts:
+        if layout.found(root):
+            return layout.load(root)
+    raise UserError(f"data folder '{root}' has no layout that is known: looked for "
+                    f"{'; '.join(layout.LOOKED_FOR for layout in layouts)}")

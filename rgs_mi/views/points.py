@@ -19,19 +19,18 @@ _COLMAP_POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("
 _COLMAP_TRACK_ITEM = 8  # bytes: int32 image, int32 keypoint
 
 
-def sparse_points(root: Path) -> tuple[np.ndarray, np.ndarray | None] | None:
-    """The points of the first of `FILES` that folder ``root`` has, in the file's own world frame, which has to be that of
-    the cameras.
+def sparse_points(root: Path, files=FILES) -> tuple[np.ndarray, np.ndarray | None] | None:
+    """The points of the first of ``files`` that folder ``root`` has, in the file's own world frame.
 
     Returns: positions [N, 3] float32, N > 0; linear colours [N, 3] float32 in [0, 1], decoded from sRGB, or None where the
     file has none. None without a file.
     Raises: UserError where the file is damaged or empty, a coordinate is not finite or beyond `FARTHEST`, or a colour
     lies outside its range.
     """
-    path = next((Path(root) / name for name in FILES if os.path.isfile(Path(root) / name)), None)
+    path = next((Path(root) / name for name in files if os.path.isfile(Path(root) / name)), None)
     if path is None:
         return None
-    read = {".ply": _read_ply, ".bin": _read_colmap_binary, ".txt": _read_colmap_text}[path.suffix]
+    read = {".bin": _read_colmap_binary, ".txt": _read_colmap_text}.get(path.suffix, _read_ply)
     try:
         positions, encoded = read(path)
         _check(positions, encoded)
