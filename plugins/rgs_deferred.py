@@ -26,6 +26,11 @@ what a principled BSDF with the G-buffer's material reflects of the environment 
    - What a reflected ray that meets a surfel brings: ``none``, the environment behind it; ``visibility``, nothing;
      ``one_bounce``, the surfel's own radiance, which in turn reflects the environment alone (Default: ``none``)
 
+ * - box
+   - |string|
+   - Six numbers, lower and upper corner: only what lies in this box reflects light, and is met by reflected rays. What lies
+     beyond, the surroundings in a capture without masks, has its diffuse radiance alone (Default: none, everything)
+
  * - shader
    - |string|
    - What a pixel makes of the specular radiance: the weights of a tiny network, an ``.npz`` that a fit with
@@ -70,7 +75,7 @@ from rgs_mi.shading.shader import Shader
 from rgs_mi.shading.split_sum import SplitSum
 from rgs_mi.splat.gbuffer import render_gbuffer
 
-from .surfels import resolve, surfels_in
+from .surfels import box_of, resolve, surfels_in
 
 AOVS = {"depth": "T", "normal": "XYZ", "albedo": "RGB", "roughness": "Y", "metallic": "Y", "alpha": "Y",
         "specular": "RGB", "diffuse": "RGB"}
@@ -91,6 +96,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         if self.samples < 1:
             raise UserError(f"rgs_deferred: samples is {self.samples}: needs at least 1")
         self.indirect = _choice(props, "indirect", "none", indirect.KINDS)
+        self.box = box_of(props)
         self.shader_file = resolve(props.get("shader", ""))
         self.shader = Shader.load(self.shader_file) if self.shader_file else None
         self.aovs = [name.strip() for name in props.get("aovs", "").split(",") if name.strip()]
@@ -137,10 +143,10 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         width, height = camera.size
         camera = camera.resized(width * samples, height * samples)
         surfels, eta = surfels_in(scene)
-        environment = self._environment(scene)
+        environment = self.environment(scene)
         gbuffer = render_gbuffer(surfels, camera)
         maps = gbuffer.all
-        image = deferred.shade(gbuffer, camera, self._lighting(scene, surfels, eta, environment, seed))
+        image = deferred.shade(gbuffer, camera, self.lighting(scene, surfels, eta, environment, seed))
         rays = deferred.pixel_directions(camera, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]))
         color, alpha = image.color, maps.alpha
         if not self.hide_emitters and environment is not None:
@@ -150,19 +156,20 @@ class DeferredIntegrator(mi.SamplingIntegrator):
             values += _aov(name, image, maps, camera, rays)
         return _average(values, width, height, samples)
 
-    def _lighting(self, scene, surfels, eta, environment, seed):
+    def lighting(self, scene, surfels, eta, environment, seed):
+        """By what `deferred.shade` shades ``surfels`` in the ``scene``, whose `environment` this is; None: nothing."""
         if self.specular == "none":
             return None
         each_other = None
         if self.indirect != "none":
-            each_other = indirect.Indirect(self.indirect, Proxies(surfels), surfels)
+            each_other = indirect.Indirect(self.indirect, Proxies(surfels, box=self.box), surfels)
         if self.specular == "split_sum":
             estimator = SplitSum(environment, eta)
         else:
             estimator = MonteCarlo(environment, scene.environment(), eta, self.samples, dr.opaque(mi.UInt32, seed))
-        return deferred.Lighting(estimator, self.shader, each_other, self.diffuse == "lit")
+        return deferred.Lighting(estimator, self.shader, each_other, self.diffuse == "lit", self.box)
 
-    def _environment(self, scene):
+    def environment(self, scene):
         """The scene's environment, filtered as the estimator needs it; kept until texels change."""
         emitter = scene.environment()
         if emitter is None:

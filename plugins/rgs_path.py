@@ -20,6 +20,11 @@ a table, shows in a mirror, throws a shadow and receives some. Any BSDF and emit
    - ``radiance``: surfels send their own radiance, as it was photographed, whatever lights them; ``lit``: their base colour
      reflects light as that of a principled BSDF (Default: ``radiance``)
 
+ * - box
+   - |string|
+   - Six numbers, lower and upper corner: only surfels in this box are in the scene, which takes an object out of the
+     surroundings that it was photographed in (Default: none, all)
+
  * - hide_emitters
    - |bool|
    - Whether emitters are invisible to the camera (Default: |false|)
@@ -38,7 +43,7 @@ from rgs_mi.errors import UserError
 from rgs_mi.rays import SurfelRays
 from rgs_mi.shading.monte_carlo import SpecularLobe, WholeLobe
 
-from .surfels import surfels_in
+from .surfels import box_of, surfels_in
 
 DIFFUSE = ("radiance", "lit")
 _NO_LIMIT = 0xFFFFFFFF
@@ -54,6 +59,7 @@ class PathIntegrator(mi.SamplingIntegrator):
         if max_depth < -1 or self.rr_depth < 1:
             raise UserError(f"rgs_path: max_depth {max_depth}, rr_depth {self.rr_depth}: need at least -1, and 1")
         self.max_depth = max_depth if max_depth >= 0 else _NO_LIMIT
+        self.box = box_of(props)
         self.diffuse = props.get("diffuse", "radiance")
         if self.diffuse not in DIFFUSE:
             raise UserError(f"rgs_path: unknown diffuse '{self.diffuse}': choose one of {', '.join(DIFFUSE)}")
@@ -61,7 +67,7 @@ class PathIntegrator(mi.SamplingIntegrator):
     @dr.syntax
     def sample(self, scene, sampler, ray, medium=None, active=True):
         surfels, eta = surfels_in(scene)
-        surfel_rays, lit = SurfelRays(surfels), self.diffuse == "lit"
+        surfel_rays, lit = SurfelRays(surfels, self.box), self.diffuse == "lit"
         lobe_of = WholeLobe if lit else SpecularLobe
         context = mi.BSDFContext()
         hides = self.hide_emitters

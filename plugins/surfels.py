@@ -44,6 +44,7 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
+from rgs_mi.box import Box
 from rgs_mi.errors import UserError
 from rgs_mi.ply import read_ply
 from rgs_mi.proxies import corners, quads
@@ -153,6 +154,15 @@ def _concatenate(clouds):
 
     fields = {name: dr.concat([column(cloud, name) for cloud in clouds], axis=0) for name in CHANNELS}
     return replace(clouds[0], **fields)
+
+
+def box_of(props):
+    """The property ``box`` of an integrator as a `Box`, None where it has none. Raises: UserError for a bad one."""
+    text = props.get("box", "")
+    try:
+        return Box.of(text.replace(",", " ").split()) if text else None
+    except ValueError as error:
+        raise UserError(f"box '{text}': {error}") from error
 
 
 def resolve(path: str) -> str:

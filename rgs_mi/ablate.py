@@ -6,27 +6,29 @@ pictures. What `scripts/ablate.py` calls.
     OUT/SCENE/VARIANT[-SEED]/        the runs, as `scripts/optimize.py` makes them
 """
 
-import contextlib
-import csv
-import hashlib
-import io
 import itertools
-import json
-import shutil
 import sys
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import checkpoint, results
 from .apart import apart
-from .comparison import DETAILS, FIGURES, mean_tables, means, picture, scene_table
-from .config import completed, presets, to_dict
+from .comparison import mean_tables, means, picture, scene_table
+from .config import presets, to_dict
 from .errors import UserError
-from .run import optimize
+from .jobs import (
+    Job,
+    budget,
+    check_names,
+    check_photographs,
+    effort,
+    find_scenes,
+    fit,
+    photographs,
+    rows_of,
+    write_tables,
+)
 from .scene import FitScene
-from .settings import Settings
-from .views import blender
 
 
 @dataclass(frozen=True)
@@ -73,50 +75,7 @@ PAPER = {
     "full": {"psnr": 35.38, "ssim": 0.976, "surfels": 0.1e6, "render_fps": 146, "normal_mae_deg": 2.04},
 }
 
-_DIGEST = "photographs.sha256"  # in a scene's folder: what its fits are of
-
-
 # ---- What there is to do ----
-
-@dataclass(frozen=True)
-class Job:
-    """One fit to the photographs ``data`` of ``scene``, into ``folder``: ``overrides`` over the preset, which make
-    ``settings`` (nested dicts). ``asked``: it is to be done now; of the others, what is there is shown."""
-
-    scene: str
-    data: Path
-    variant: str
-    seed: int
-    overrides: tuple[str, ...]
-    settings: dict
-    folder: Path
-    asked: bool
-
-    def has(self, saved: dict) -> bool:
-        """Whether the settings ``saved`` with a fit are this job's."""
-        return completed(Settings, saved) == self.settings
-
-    def figures(self) -> dict | None:
-        """metrics.json of the finished fit; None where there is none, or one with other settings."""
-        if not results.finished(self.folder):
-            return None
-        figures = json.loads((self.folder / results.METRICS).read_text())
-        return figures if self.has(figures["settings"]) else None
-
-
-def find_scenes(suite) -> dict[str, Path]:
-    """name -> scene file or capture: the ``*.xml`` in the folder ``suite``, and its subfolders in the Blender layout.
-
-    Raises: UserError where there are none.
-    """
-    suite = Path(suite)
-    captures = {path.parent.name: path.parent for path in suite.glob(f"*/{blender.TRAIN}")}
-    found = {path.stem: path for path in suite.glob("*.xml")} | captures
-    if not found:
-        raise UserError(f"{suite} holds neither scenes (*.xml) nor captures (folders with {blender.TRAIN}): "
-                        "give a folder of some")
-    return dict(sorted(found.items()))
-
 
 def known_variants() -> dict[str, Variant]:
     """`VARIANTS`, and every preset by its name."""
@@ -129,19 +88,17 @@ def plan(suite, xml, *, scenes=None, variants=None, minutes=None, overrides=(), 
     Raises: UserError for a scene, variant or setting that does not exist.
     """
     found, known = find_scenes(suite), known_variants()
-    for kind, names, there in (("scene", scenes, found), ("variant", variants, known)):
-        for name in names or ():
-            if name not in there:
-                raise UserError(f"no {kind} '{name}': choose from {', '.join(there)}")
+    check_names("scene", scenes, found)
+    check_names("variant", variants, known)
     template = FitScene.load(xml, next(iter(found.values())))
-    budget = [f"minutes={minutes}", "iterations=null"] if minutes is not None else []
     jobs = []
     shown = dict.fromkeys([*VARIANTS, *(variants or ())])
     for seed, (k, scene), name in itertools.product(dict.fromkeys(seeds), enumerate(found), shown):
         variant = known[name]
         wanted = name in variants if variants else variant.scenes is None or k < variant.scenes
-        changes = (*variant.overrides, *overrides, *budget, f"seed={seed}")
-        jobs.append(Job(scene, found[scene], name, seed, changes, to_dict(template.settings(variant.preset, changes)),
+        changes = (*variant.overrides, *overrides, *budget(minutes), f"seed={seed}")
+        jobs.append(Job(scene, found[scene], name, seed, variant.preset, changes,
+                        to_dict(template.settings(variant.preset, changes)),
                         Path(out) / scene / (f"{name}-{seed}" if seed else name),
                         asked=wanted and (not scenes or scene in scenes)))
     return jobs
@@ -174,8 +131,8 @@ def ablate(suite, xml, *, scenes=None, variants=None, minutes=None, overrides=()
         print("stopped; the same command goes on from here", file=sys.stderr)
         raise
     finally:
-        summary = _write(jobs, errors, out)
-    print("\n".join([summary, "", *(str(out / f"ablation.{suffix}") for suffix in ("md", "csv", "json"))]))
+        summary, paths = _write(jobs, errors, out)
+    print("\n".join([summary, "", *map(str, paths)]))
     return len(errors)
 
 
@@ -187,8 +144,8 @@ def _fit_scene(group, jobs, errors, xml, out, quiet):
 
     scene = group[0].scene
     try:
-        digest, views = apart(_photographs, xml, group[0].data, quiet)
-        _check_photographs(out / scene, digest)
+        digest, views = apart(photographs, xml, group[0].data, quiet)
+        check_photographs(out / scene, digest)
     except UserError as error:
         for job in group:
             failed(job, error)
@@ -200,9 +157,7 @@ def _fit_scene(group, jobs, errors, xml, out, quiet):
                 if not quiet:
                     print(job.folder, flush=True)
                 try:
-                    apart(_fit, xml, job, quiet)
-                    if job.figures() is None:
-                        raise UserError("stopped before its end: the same command goes on")
+                    apart(fit, xml, job, quiet)
                 except UserError as error:
                     failed(job, error)
                 _write(jobs, errors, out)
@@ -216,75 +171,22 @@ def _fit_scene(group, jobs, errors, xml, out, quiet):
             warnings.warn(f"{out / scene}: no picture ({type(error).__name__}: {error})", stacklevel=2)
 
 
-def _photographs(xml, data, quiet):
-    """The scene's photographs, path-traced first where need be: a digest of all, and the test views for the picture."""
-    dataset = FitScene.load(xml, data).dataset(quiet)
-    digest = hashlib.sha256()
-    for view in [*dataset.train, *dataset.test]:
-        for part in (view.name.encode(), view.camera.to_world.tobytes(), view.pixels.tobytes()):
-            digest.update(part)
-    return digest.hexdigest(), results.shown(results.judged(dataset))[::2]
-
-
-def _check_photographs(folder, digest):
-    """Note what the fits below ``folder`` are of. Raises: UserError where those that are there are of other photographs."""
-    path = folder / _DIGEST
-    if path.is_file() and path.read_text().strip() != digest:
-        raise UserError(f"{folder} holds fits to other photographs: delete it, or choose another --out")
-    with checkpoint.atomic_file(path) as stream:
-        stream.write(f"{digest}\n".encode())
-
-
-def _fit(xml, job, quiet):
-    """Do a job, or go on with it."""
-    saved = checkpoint.load_latest(job.folder)
-    resume = saved is not None and not results.finished(job.folder) and job.has(saved[1]["settings"])
-    if saved and not resume:
-        warnings.warn(f"{job.folder} had other settings: starting again", stacklevel=2)
-        shutil.rmtree(job.folder / "checkpoints")
-    with contextlib.redirect_stdout(io.StringIO()):
-        optimize(xml, data=job.data, config=known_variants()[job.variant].preset, overrides=job.overrides, out=job.folder,
-                 resume=resume, quiet=quiet)
-
-
 # ---- What comes out ----
 
-def rows_of(jobs, errors) -> list[dict]:
-    """A row (see `comparison`) for each fit that is there or was asked for."""
-    rows = []
-    for job in jobs:
-        error = errors.get(job.folder)
-        figures = None if error else job.figures()
-        if figures or job.asked:
-            status = "failed" if error else "finished" if figures else "missing"
-            rows.append({"scene": job.scene, "variant": job.variant, "seed": job.seed, "status": status}
-                        | {name: figures and figures[name] for name in (*FIGURES, *DETAILS)} | {"error": error})
-    return rows
-
-
-def _write(jobs, errors, out) -> str:
-    """Write the tables; returns the summary."""
+def _write(jobs, errors, out):
+    """Write the tables: the summary of them, and their paths."""
     rows, variants = rows_of(jobs, errors), known_variants()
     table = means(rows, variants)
     summary = f"{_introduction(jobs)}\n\n{mean_tables(table, variants, PAPER)}"
     sections = ["# Ablation", summary]
     for scene in dict.fromkeys(row["scene"] for row in rows):
-        sections += [f"## {scene}", scene_table([row for row in rows if row["scene"] == scene], variants)]
+        sections += [f"## {scene}", scene_table([(variants[r["variant"]].label, r) for r in rows if r["scene"] == scene])]
         sections += [f"![{scene}]({scene}.png)"] * (out / f"{scene}.png").is_file()
-    lines = io.StringIO()
-    writer = csv.DictWriter(lines, ("scene", "variant", "seed", "status", *FIGURES, *DETAILS, "error"))
-    writer.writeheader()
-    writer.writerows(rows)
-    for suffix, text in {"md": "\n\n".join(sections) + "\n", "csv": lines.getvalue(),
-                         "json": json.dumps({"runs": rows, "means": table, "paper": PAPER}, indent=1) + "\n"}.items():
-        with checkpoint.atomic_file(out / f"ablation.{suffix}") as stream:
-            stream.write(text.encode())
-    return summary
+    return summary, write_tables(out, "ablation", sections, rows, {"means": table, "paper": PAPER})
 
 
 def _introduction(jobs):
-    settings, seeds = jobs[0].settings, list(dict.fromkeys(job.seed for job in jobs))
-    budget = f"{settings['iterations']} steps" if settings["iterations"] else f"{settings['minutes']:g} minutes"
-    return (f"{budget} a fit; seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}. Figures of held-out views: means "
-            "over views, seeds, scenes. Δ: the difference on the scenes and seeds that both have; in brackets that of each "
-            "seed. The paper's are of Shiny Blender.")
+    seeds = list(dict.fromkeys(job.seed for job in jobs))
+    return (f"{effort(jobs[0].settings)}; seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}. Figures of held-out "
+            "views: means over views, seeds, scenes. Δ: the difference on the scenes and seeds that both have; in brackets "
+            "that of each seed. The paper's are of Shiny Blender.")

@@ -1,11 +1,13 @@
-"""A function call in a process of its own: its memory goes back, its crash is not ours, Ctrl-C lets it save."""
+"""Function calls in processes of their own: their memory goes back, their crash is not ours, Ctrl-C lets them save."""
 
 import multiprocessing
 import os
 import signal
 import threading
 import traceback
+from multiprocessing.connection import wait
 
+import drjit as dr
 import mitsuba as mi
 
 from .errors import UserError, run_main
@@ -19,40 +21,83 @@ def apart(function, *arguments):
     Raises: UserError, in one line, for whatever goes wrong there, a crash or kill included; KeyboardInterrupt after Ctrl-C,
     when the process has ended. Pressing again kills it.
     """
-    context = multiprocessing.get_context("spawn")
-    receive, send = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(send, mi.variant(), function, arguments))
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited: of Ctrl-C the process hears from us alone
-    try:
-        process.start()
-    finally:
-        signal.signal(signal.SIGINT, before)
-    send.close()
-    try:
-        try:
-            value, error = receive.recv()
-        except EOFError:  # it ended without a word
-            value, error = None, None
-        process.join()
-    except KeyboardInterrupt:
-        process.terminate()
-        process.join()
-        raise
-    finally:
-        process.kill()
-    if process.exitcode < 0:
-        hint = ", perhaps for want of memory" if process.exitcode == -signal.SIGKILL else ""
-        raise UserError(f"killed by {signal.Signals(-process.exitcode).name}{hint}")
-    if error or process.exitcode:
-        raise UserError(error or f"ended with code {process.exitcode}")
+    (_, value, error), = each_apart(function, [arguments])
+    if error:
+        raise error
     return value
 
 
-def _work(send, variant, function, arguments):
+def each_apart(function, calls, workers=1):
+    """`apart` for each of ``calls``, tuples of arguments, up to ``workers`` at a time, among which the cores are divided.
+
+    Yields: (arguments, value, None) or (arguments, None, UserError), as they end.
+    Raises: KeyboardInterrupt after Ctrl-C, when all have ended.
+    """
+    waiting, running = list(calls), {}
+    # set_variant() says why never one
+    threads = max(2, _cores() // workers) if min(workers, len(waiting)) > 1 else None
+    try:
+        while waiting or running:
+            while waiting and len(running) < workers:
+                call = _Call(function, waiting.pop(0), threads)
+                running[call.receive] = call
+            for receive in wait(list(running)):
+                result = running[receive].result()
+                yield running.pop(receive).arguments, *result
+    except (KeyboardInterrupt, GeneratorExit):
+        for call in running.values():
+            call.process.terminate()
+        for call in running.values():
+            call.process.join()
+        raise
+    finally:
+        for call in running.values():
+            call.process.kill()
+
+
+def _cores():
+    """Those that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
+class _Call:
+    """A call that runs in ``process``, and ends with something to ``receive``."""
+
+    def __init__(self, function, arguments, threads):
+        self.arguments = arguments
+        context = multiprocessing.get_context("spawn")
+        self.receive, send = context.Pipe(duplex=False)
+        self.process = context.Process(target=_work, args=(send, mi.variant(), threads, function, arguments))
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited: of Ctrl-C the process hears from us alone
+        try:
+            self.process.start()
+        finally:
+            signal.signal(signal.SIGINT, before)
+        send.close()
+
+    def result(self):
+        """(value, None) or (None, UserError)."""
+        try:
+            value, error = self.receive.recv()
+        except EOFError:  # it ended without a word
+            value, error = None, None
+        self.process.join()
+        code = self.process.exitcode
+        if code < 0:
+            hint = ", perhaps for want of memory" if code == -signal.SIGKILL else ""
+            error = f"killed by {signal.Signals(-code).name}{hint}"
+        elif code:
+            error = error or f"ended with code {code}"
+        return (None, UserError(error)) if error else (value, None)
+
+
+def _work(send, variant, threads, function, arguments):
     """What the process does: send (value, None), or (None, what went wrong)."""
     def main():
         try:
             set_variant(variant)
+            if threads:
+                dr.set_thread_count(threads)
             send.send((function(*arguments), None))
         except UserError as error:
             send.send((None, str(error)))

@@ -14,7 +14,7 @@ from .pictures import crop, to_8bit
 
 SCORES = ("psnr", "ssim", "lpips", "normal_mae_deg")  # those of `evaluate.SCORES` that tables have room for
 FIGURES = (*SCORES, "surfels", "render_fps", "train_seconds")
-DETAILS = ("iterations", "peak_rss_mb")
+DETAILS = ("iterations", "peak_rss_mb", "normal_ssim", "normal_lpips")
 _HEADER = ("PSNR", "SSIM", "LPIPS", "normals", "surfels", "views/s", "min")
 _PANEL, _GAP, _MARGIN, _TEXT = 260, 8, 24, 20  # pixels of the picture
 _INK = (60, 60, 60)
@@ -35,12 +35,12 @@ def means(rows, variants) -> dict[str, dict]:
         seeds = sorted({seed for _, seed in pairs})
         of_seed = {seed: {key: d for key, d in pairs.items() if key[1] == seed} for seed in seeds}
         table[variant] = {
-            "scenes": len({scene for scene, _ in mine}), **_mean(mine, FIGURES), "against": against,
-            "difference": _mean(pairs, SCORES), "difference_by_seed": {s: _mean(of_seed[s], SCORES) for s in seeds}}
+            "scenes": len({scene for scene, _ in mine}), **mean(mine, FIGURES), "against": against,
+            "difference": mean(pairs, SCORES), "difference_by_seed": {s: mean(of_seed[s], SCORES) for s in seeds}}
     return table
 
 
-def _mean(figures, names) -> dict:
+def mean(figures, names) -> dict:
     """Of {(scene, seed): {name: value}}: the mean over scenes of the mean over their seeds; None of nothing."""
     result = {}
     for name in names:
@@ -97,13 +97,13 @@ def _published(published, variant, against):
             _cell("normal_mae_deg", figures.get("normal_mae_deg")), _cell("surfels", figures.get("surfels"))]
 
 
-def scene_table(rows, variants) -> str:
-    """The ``rows`` of one scene as text."""
+def scene_table(rows) -> str:
+    """``rows``, [(name, row)], of one scene or one variant as text."""
     lines = [("", "seed", *_HEADER, "MB", "")]
-    for r in rows:
+    for name, r in rows:
         note = "" if r["status"] == "finished" else r["error"] or "not yet"
-        lines.append((variants[r["variant"]].label, str(r["seed"]), *(_cell(n, r[n]) for n in FIGURES),
-                      _cell("peak_rss_mb", r["peak_rss_mb"]), note.replace("|", "\\|")))
+        lines.append((name, str(r["seed"]), *(_cell(n, r[n]) for n in FIGURES), _cell("peak_rss_mb", r["peak_rss_mb"]),
+                      note.replace("|", "\\|")))
     return text_table(lines)
 
 

@@ -29,8 +29,9 @@ class Gradients:
         return self.sum.numpy() / np.maximum(self.count.numpy(), 1)
 
 
-def densify(model, gradients: Gradients, extent: float, settings, rng, budget: int, guided=None) -> None:
-    """One round of density control, in place. ``extent``: radius of the object in world units; ``settings``: `Density`.
+def densify(model, gradients: Gradients, extent: float | np.ndarray, settings, rng, budget: int, guided=None) -> None:
+    """One round of density control, in place. ``extent``: radius of the object in world units, or [N] what is large for each
+    surfel; ``settings``: `Density`.
 
     Surfels whose mean gradient exceeds the threshold are cloned when small and split when large, the largest gradients
     first while ``budget`` (surfels in all) lasts; for those that are ``guided`` ([N] bool or None) half the threshold is
@@ -49,8 +50,8 @@ def densify(model, gradients: Gradients, extent: float, settings, rng, budget: i
     hot = np.flatnonzero(keep & (gradient > settings.threshold))
     room = max(0, budget - int(keep.sum()))
     hot = hot[np.argsort(-gradient[hot], kind="stable")][:room]
-    split = hot[largest[hot] > settings.dense * extent]
-    clone = hot[largest[hot] <= settings.dense * extent]
+    large = largest > settings.dense * extent
+    split, clone = hot[large[hot]], hot[~large[hot]]
 
     stay = np.flatnonzero(keep)
     index = np.concatenate([stay, clone, split])

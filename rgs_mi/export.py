@@ -40,7 +40,8 @@ def export(folder, scene, surfels, environment, shading, indirect, shader, views
     if shader:
         shader.save(folder / SHADER)
     root = _fitted(scene, surfels, environment, {"specular": shading.specular, "diffuse": shading.diffuse,
-                                                 "indirect": indirect, "shader": SHADER if shader else None})
+                                                 "indirect": indirect, "shader": SHADER if shader else None,
+                                                 "box": shading.box})
     if any(abs(v.camera.focal[0] / v.camera.focal[1] - 1) > 1e-4 for v in views):
         warnings.warn(f"{folder / SCENE}: the cameras' pixels are not square, those of its sensors are", stacklevel=2)
     root.extend(_sensor(view) for view in views)

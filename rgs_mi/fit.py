@@ -9,6 +9,7 @@ import numpy as np
 
 from . import losses
 from .aligned import lanes
+from .curves import Curves
 from .density import Gradients, densify
 from .guided import boxes, guided, picture, reflective_mask
 from .model import ENVIRONMENT, SHADER, Model
@@ -34,7 +35,7 @@ class Fit:
 
     ``settings``: `Settings`. ``extent``: radius of the object in world units. ``shading``: how the scene is.
     ``priors``: a `DepthPrior` for each training view, or None. ``elapsed``: seconds spent so far,
-    earlier sessions included.
+    earlier sessions included; ``curves``: what its steps measured.
     """
 
     def __init__(self, dataset, model: Model, settings, extent: float, shading=Shading(), priors=None):
@@ -48,13 +49,14 @@ class Fit:
         self.proxies = self.emitter = None  # what reflected rays meet; what samples the light
         self._reflective = {}  # (camera, boxes) of what was reflective when a view was last seen
         self.psnr, self.failures = 0.0, 0
+        self.curves = Curves()
 
     def state(self) -> tuple[dict, dict]:
         """(arrays, meta) for a checkpoint: with `resume` the fit goes on as if it had not been interrupted."""
         arrays = self.model.state() | {"gradient_sum": self.gradients.sum.numpy(),
                                        "gradient_count": self.gradients.count.numpy()}
         return arrays, {"step": self.step_number, "views_used": self.views_used, "elapsed": self.elapsed,
-                        "extent": self.extent}
+                        "extent": self.extent, "curves": self.curves.rows}
 
     @classmethod
     def resume(cls, dataset, settings, arrays: dict, meta: dict, **others) -> "Fit":
@@ -62,6 +64,7 @@ class Fit:
         fit = cls(dataset, Model.from_state(arrays), settings, meta["extent"], **others)
         fit.step_number, fit.views_used, fit.elapsed = meta["step"], meta["views_used"], meta["elapsed"]
         fit.gradients.sum, fit.gradients.count = (lanes(arrays[f"gradient_{k}"]) for k in ("sum", "count"))
+        fit.curves = Curves(meta.get("curves", ()))  # checkpoints of version 0.1.0 have none
         return fit
 
     @property
@@ -74,6 +77,11 @@ class Fit:
     @property
     def stage(self):
         return next((s for s in self.settings.stages if self.progress < s.until), self.settings.stages[-1])
+
+    @property
+    def pixels(self) -> int:
+        """Width of the photographs by now."""
+        return max(self.dataset.train[0].camera.size[0] // self.stage.downscale, 1)
 
     @property
     def sh_order(self) -> int:
@@ -107,8 +115,9 @@ class Fit:
             return None
         indirect = None
         if self._sees_itself:
-            indirect = Indirect(self.settings.indirect, self.proxies if training else Proxies(surfels), surfels)
-        return deferred.Lighting(self._estimator(training), self.model.shader(), indirect, self._lit)
+            indirect = Indirect(self.settings.indirect, self.proxies if training else self._proxies(surfels), surfels)
+        return deferred.Lighting(self._estimator(training), self.model.shader(), indirect, self._lit,
+                                 self.shading.box)
 
     def _estimator(self, training):
         """Of the specular integral, by now."""
@@ -128,13 +137,17 @@ class Fit:
     def _refresh(self, surfels):
         """Rebuild what is used for many steps."""
         if self.step_number % _REBUILD == 0 or self.proxies is None:
-            self.proxies = Proxies(surfels) if self._sees_itself else None
+            self.proxies = self._proxies(surfels) if self._sees_itself else None
         if self.step_number % _REBUILD == 0 or self.emitter is None:
             self.emitter = self.model.environment().emitter() if self._samples_light else None
 
-    def step(self):
-        """One step of the optimiser on the next few views, and density control when it is due."""
-        start = time.monotonic()
+    def _proxies(self, surfels):
+        return Proxies(surfels, box=self.shading.box)
+
+    def step(self) -> bool:
+        """One step of the optimiser on the next few views, and density control when it is due. Returns whether ``curves``
+        has another row."""
+        start, pixels = time.monotonic(), self.pixels
         stage, s = self.stage, self.settings
         if self.photographs is None or self.photographs.downscale != stage.downscale:
             self.photographs = Photographs(self.dataset.train, stage.downscale, s.background, self.priors)
@@ -150,17 +163,22 @@ class Fit:
         dr.enable_grad(leaves)
         surfels = Surfels(*leaves[:len(CHANNELS)], surfels.two_sided)
         lighting = lighting and lighting.with_learned(leaves[len(CHANNELS):], surfels)
-        errors = [self._view(i, surfels, lighting, 1 / len(views)) for i in views]
+        measured = [self._view(i, surfels, lighting, 1 / len(views)) for i in views]
         for value, leaf in zip(shared, leaves):
             gradient = dr.grad(leaf)
             dr.set_grad(value, dr.select(dr.isfinite(gradient), gradient, 0))  # one overflow must not end a fit
             dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
         self.model.optimizer.step()
-        self._judge(np.mean([float(e[0]) for e in errors]))
+        dr.eval(measured)
+        mean = {name: np.mean([float(m[name][0]) for m in measured if name in m]) for m in measured for name in m}
+        self._judge(mean.pop("error"))
         self.step_number += 1
         self._control_density()
-        self.elapsed += time.monotonic() - start
+        seconds = time.monotonic() - start
+        self.elapsed += seconds
+        state = {"step": self.step_number, "seconds": self.elapsed, "surfels": len(self.model), "pixels": pixels}
+        return self.curves.add(self.progress, state, {"psnr": self.psnr, "ms": 1e3 * seconds} | mean)
 
     def _judge(self, error):
         """Note the step's mean squared error. One that is not a number is an overflow in some pixel; when it stays, the fit
@@ -172,7 +190,7 @@ class Fit:
             self.psnr = float("nan")
 
     def _view(self, i, surfels, lighting, weight):
-        """Accumulate the gradients of one view's loss; returns its mean squared error."""
+        """Accumulate the gradients of one view's loss; returns its parts and the mean squared ``error``."""
         photo = self.photographs[i]
         w, size = self.settings.weights, photo.camera.size
         offset = dr.zeros(mi.Vector2f, len(self.model))
@@ -180,37 +198,37 @@ class Fit:
         image = deferred.render(surfels, photo.camera, lighting, offset, squares=w.distortion > 0)
         maps = image.gbuffer.all
         rendered = losses.display(image.color, maps.alpha, self.settings.background)
-        loss = losses.photometric(rendered, photo.color, size, w.dssim)
+        parts = {"loss.photometric": losses.photometric(rendered, photo.color, size, w.dssim)}
         if w.mask > 0 and self.dataset.train[i].masked:
-            loss += w.mask * losses.mask(maps.alpha, photo.alpha)
+            parts["loss.mask"] = w.mask * losses.mask(maps.alpha, photo.alpha)
         if w.delta_normal > 0:
-            loss += w.delta_normal * losses.delta_normal(image.gbuffer)
+            parts["loss.delta_normal"] = w.delta_normal * losses.delta_normal(image.gbuffer)
         if w.distortion > 0:
-            loss += w.distortion * losses.distortion(maps, self.extent)
+            parts["loss.distortion"] = w.distortion * losses.distortion(maps, self.extent)
         consistency = dr.opaque(mi.Float, self._scheduled(w.consistency))
-        loss += consistency * losses.depth_normal_consistency(image.gbuffer, photo.camera)
+        parts["loss.consistency"] = consistency * losses.depth_normal_consistency(image.gbuffer, photo.camera)
         share = size[0] * size[1] / (photo.size[0] * photo.size[1])  # these are means over the whole photograph
-        loss = share * loss + self._regional(i, image.gbuffer, photo)
+        parts = {name: share * part for name, part in parts.items()} | self._regional(i, image.gbuffer, photo)
         error = dr.mean(dr.mean(dr.square(dr.detach(rendered) - photo.color))) * share
-        dr.backward(loss * weight)
+        dr.backward(sum(parts.values()) * weight)
         self.gradients.add(dr.grad(offset) / weight, image.gbuffer.seen, photo.size)
-        return error
+        return dr.detach(parts) | {"error": error}
 
     def _regional(self, i, gbuffer, photo):
         """RGS's losses of view ``i`` that are normalised by regions of their own, L_normal and L_depth; notes what is
         reflective for density control."""
-        w, maps, loss = self.settings.weights, gbuffer.all, mi.Float(0)
+        w, maps, parts = self.settings.weights, gbuffer.all, {}
         if w.normal > 0 or self.settings.density.guided:
-            mask = self._reflective_mask(gbuffer)
+            mask = self._reflective_mask(gbuffer, photo.camera)
             if self.settings.density.guided:
                 self._reflective[i] = photo.camera, boxes(mask)
             if w.normal > 0:
-                loss += w.normal * losses.normal_smoothness(gbuffer, mask, w.crease)
+                parts["loss.normal"] = w.normal * losses.normal_smoothness(gbuffer, mask, w.crease)
         if w.depth > 0 and photo.prior is not None:
             covered = maps.alpha > 0.5
             depth = maps.depth / dr.select(covered, maps.alpha, 1)
-            loss += w.depth * losses.pearson_depth(depth, photo.prior, covered, photo.inverse)
-        return loss
+            parts["loss.depth"] = w.depth * losses.pearson_depth(depth, photo.prior, covered, photo.inverse)
+        return parts
 
     def _next_views(self, count):
         """Views of the next step: random orders of all, one after another, that depend on seed and position alone."""
@@ -245,9 +263,16 @@ class Fit:
             opened = (self.progress - d.start) / (d.stop - d.start)
             budget = int(self.settings.start.surfels + opened * (d.max_surfels - self.settings.start.surfels))
             rng = np.random.default_rng((self.settings.seed, self.step_number))
-            densify(self.model, self.gradients, self.extent, d, rng, budget, self._guided())
+            densify(self.model, self.gradients, self._reach(), d, rng, budget, self._guided())
             self.proxies = None
         self.gradients = Gradients(len(self.model))
+
+    def _reach(self):
+        """What is large for a surfel: the object, or the distance from it in the surroundings."""
+        if self.shading.box is None:
+            return self.extent
+        away = np.linalg.norm(self.model.numpy("centers") - self.shading.box.centre, axis=1)
+        return np.maximum(self.extent, away)
 
     def _guided(self):
         """[N] which surfels get half the threshold of density control; None: no one does."""
@@ -268,11 +293,12 @@ class Fit:
             shown = losses.display(image.color, image.gbuffer.all.alpha, self.settings.background)
         width, height = camera.size
         shown = np.clip(shown.numpy().T.reshape(height, width, 3), 0, 1)
-        mask = self._reflective_mask(image.gbuffer)
+        mask = self._reflective_mask(image.gbuffer, camera)
         return picture(shown, mask, found, camera, self.model.numpy("centers")[flags])
 
-    def _reflective_mask(self, gbuffer):
+    def _reflective_mask(self, gbuffer, camera):
         """β̂ of a view, [H, W] bool."""
         width, height = gbuffer.size
-        roughness, alpha = (dr.detach(v).numpy().reshape(height, width) for v in (gbuffer.all.roughness, gbuffer.all.alpha))
+        alpha = dr.select(deferred.within(gbuffer, camera, self.shading.box), gbuffer.all.alpha, 0)
+        roughness, alpha = (dr.detach(v).numpy().reshape(height, width) for v in (gbuffer.all.roughness, alpha))
         return reflective_mask(roughness / np.maximum(alpha, 1e-6), alpha, self.settings.reflective)

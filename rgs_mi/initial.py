@@ -7,6 +7,7 @@ from .color import srgb_decode
 from .priors import hull
 from .views import Dataset
 
+_FAR = 10
 _SRGB_TO_LINEAR = srgb_decode(np.arange(256) / 255).astype(np.float32)
 
 
@@ -40,6 +41,16 @@ def initial_points(dataset: Dataset, count: int, seed: int = 0, on_hull: bool = 
         ball *= rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1, keepdims=True)
         positions = (centre + reach * min(half, 1.0) * ball).astype(np.float32)
     return positions, None, _colors(positions, views), _spacing(positions)
+
+
+def surroundings(dataset: Dataset, count: int, seed: int = 0):
+    """Points far away for what lies behind an object without a mask: on a sphere about it, `_FAR` times as far as the
+    cameras. Returns: as `initial_points`; the normals point inwards."""
+    centre, reach = hull.looked_at([view.camera for view in dataset.train])
+    outward = np.random.default_rng((seed, 1)).normal(size=(count, 3))
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    positions = (centre + _FAR * reach * outward).astype(np.float32)
+    return positions, -outward, _colors(positions, dataset.train), _spacing(positions)
 
 
 def _spacing(positions: np.ndarray) -> np.ndarray:

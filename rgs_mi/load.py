@@ -33,3 +33,15 @@ def surfels_of(scene, path):
     if len(found) != 1:
         raise UserError(f"{path}: has {len(found)} shapes of type 'surfels': a scene to fit has exactly one")
     return found[0]
+
+
+def lit_surfels(scene, path):
+    """The scene's `Surfels`, and the `Lighting` by which its integrator shades them (None: diffuse radiance alone).
+
+    Raises: UserError where there are no surfels, more than one shape of them, or another integrator than 'rgs_deferred'.
+    """
+    shape, integrator = surfels_of(scene, path), scene.integrator()
+    if not hasattr(integrator, "specular"):
+        raise UserError(f"{path}: its integrator is a {integrator.class_name()}: surfels need 'rgs_deferred'")
+    environment = integrator.environment(scene)
+    return shape.surfels, integrator.lighting(scene, shape.surfels, shape.eta, environment, seed=0)

@@ -45,13 +45,15 @@ class Model:
 
     @classmethod
     def start(cls, positions, normals, colors, spacing, environment, rotation, sh_order, seed=0, scale=1.0,
-              roughness=0.3, shader="identity"):
-        """Surfels at ``positions`` [N, 3], facing ``normals`` [N, 3] (outward, one-sided; None: random, two-sided), of
-        ``colors`` [N, 3] (linear), as wide as ``scale`` times their ``spacing`` [N], all of one ``roughness``;
-        ``environment`` [rows, columns, 3] radiance to start from; ``shader``: as `Settings` has it."""
+              opacity=0.7, roughness=0.3, shader="identity", two_sided=None):
+        """Surfels at ``positions`` [N, 3], facing ``normals`` [N, 3] (None: random), of ``colors`` [N, 3] (linear), as wide
+        as ``scale`` times their ``spacing`` [N], all of one ``opacity`` and ``roughness``; ``two_sided`` (None: where
+        normals are random, else they point outwards); ``environment`` [rows, columns, 3] radiance to start from;
+        ``shader``: as `Settings` has it."""
         from .surfel import rotation_from_normal
 
         n, rng = len(positions), np.random.default_rng(seed)
+        two_sided = normals is None if two_sided is None else two_sided
         if normals is None:
             normals = rng.normal(size=(n, 3))
             normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -59,7 +61,7 @@ class Model:
             "centers": positions,
             "rotations": rotation_from_normal(normals, rng.uniform(0, 2 * np.pi, n)),
             "log_scales": np.log(scale * np.repeat(spacing[:, None], 2, 1)),
-            "logit_opacities": np.full((n, 1), logit(0.7)),
+            "logit_opacities": np.full((n, 1), logit(opacity)),
             "sh_dc": (0.5 * colors - 0.5) / 0.28209479,
             "sh_rest": np.zeros((n, 3 * ((sh_order + 1) ** 2 - 1))),
             "logit_base_color": np.full((n, 3), logit(0.5)),
@@ -68,7 +70,7 @@ class Model:
             "delta_normal": np.zeros((n, 3)),
             ENVIRONMENT: np.log(np.maximum(environment, 1e-3)),
             **({SHADER: initial_weights(seed)} if shader == "mlp" else {}),
-        }, rotation, two_sided=normals is None)
+        }, rotation, two_sided)
 
     def __len__(self):
         return self.optimizer["centers"].shape[0]

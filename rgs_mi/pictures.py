@@ -1,4 +1,4 @@
-"""What people look at: pictures of each test view, and one sheet that tells the whole fit."""
+"""What people look at: pictures of each test view, panels that take it apart, and one sheet that tells the whole fit."""
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -9,8 +9,13 @@ from .evaluate import Rendering, photograph
 from .export import write_exr
 
 ERROR_GAIN = 4  # of the absolute error in comparisons
+ERROR_RANGE, NORMAL_RANGE = 0.2, 20  # what the ramp of errors ends at: display values, degrees
+#: Colours of errors, from none to the largest, evenly spaced; from light to dark.
+RAMP = np.array([[255, 255, 255], [250, 214, 122], [235, 130, 56], [184, 51, 69], [84, 18, 74]]) / 255
 _PANEL, _GAP, _MARGIN, _TEXT = 280, 12, 32, 24  # pixels of the contact sheet
 _INK = (60, 60, 60)
+_ON_SHEET = ("photograph", "rendering", "normals", "true normals", "roughness", "metallic", "base color", "diffuse",
+             "specular")
 
 
 def write_png(path, image: np.ndarray):
@@ -20,8 +25,8 @@ def write_png(path, image: np.ndarray):
 
 
 def to_8bit(image) -> np.ndarray:
-    """Display values in [0, 1] to uint8, rounded."""
-    return np.uint8(np.clip(np.nan_to_num(image), 0, 1) * 255 + 0.5)
+    """Display values in [0, 1] to uint8, rounded; those that are already stay."""
+    return image if image.dtype == np.uint8 else np.uint8(np.clip(np.nan_to_num(image), 0, 1) * 255 + 0.5)
 
 
 def write_view(folder, view, rendering: Rendering, background, gbuffer: bool):
@@ -38,13 +43,78 @@ def write_view(folder, view, rendering: Rendering, background, gbuffer: bool):
         write_exr(folder / f"{view.name}_gbuffer.exr", np.concatenate(list(maps.values()), -1), names)
 
 
+# ---- Panels ----
+
+def panels(view, rendering: Rendering, background) -> dict[str, np.ndarray]:
+    """A view taken apart: name -> [H, W, 3] uint8 over white, all cropped to the object.
+
+    ``photograph``, ``rendering``; ``error`` (mean absolute difference of display values, from 0 to `ERROR_RANGE`);
+    ``normals`` and, where the view has them, ``true normals`` (world space) and ``normal error`` (angle, from 0 to
+    `NORMAL_RANGE`); ``depth`` (along the axis, near is light); ``roughness``, ``metallic``, ``base color``; ``diffuse`` and
+    ``specular`` radiance, clipped.
+    """
+    alpha, maps, truth = rendering.alpha, rendering.maps, photograph(view, background)
+    over_white = lambda premultiplied: premultiplied + (1 - alpha)
+    mean = lambda name: maps[name] / np.maximum(alpha, 1e-6)
+    light = lambda name: over_white(srgb_encode(np.clip(mean(name), 0, 1)) * alpha)
+    images = {"photograph": truth, "rendering": rendering.image,
+              "error": ramp(np.abs(rendering.image - truth).mean(-1) / ERROR_RANGE),
+              "normals": over_white((maps["normal"] + alpha) / 2)}
+    if view.normal is not None:
+        known = np.linalg.norm(view.normal, axis=-1, keepdims=True) > 0.5
+        images["true normals"] = np.where(known, view.normal / 2 + 0.5, 1)
+        images["normal error"] = np.where(known, ramp(_angles(maps["normal"], view.normal) / NORMAL_RANGE), 1)
+    images |= {"depth": over_white(alpha * _nearness(mean("depth"), alpha > 0.5)).repeat(3, -1),
+               "roughness": over_white(maps["roughness"]).repeat(3, -1),
+               "metallic": over_white(maps["metallic"]).repeat(3, -1), "base color": light("base_color"),
+               "diffuse": light("diffuse"), "specular": light("specular")}
+    return crop({name: to_8bit(image) for name, image in images.items()}, view)
+
+
+def ramp(values: np.ndarray) -> np.ndarray:
+    """Values in [0, 1], any shape, as colours of `RAMP` [..., 3]; what is beyond has the last one."""
+    return np.stack([np.interp(values, np.linspace(0, 1, len(RAMP)), channel) for channel in RAMP.T], -1)
+
+
+def _angles(a, b):
+    """[H, W] degrees between vectors [H, W, 3] of any length; 90 where one is zero."""
+    length = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
+    cosine = np.where(length > 0, (a * b).sum(-1) / np.where(length > 0, length, 1), 0)
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def _nearness(depth, covered):
+    """0.95 for the nearest that is ``covered``, 0.05 for the farthest."""
+    if not covered.any():
+        return np.ones_like(depth)
+    near, far = np.percentile(depth[covered], (1, 99))
+    return 0.05 + 0.9 * np.clip((far - depth) / max(far - near, 1e-9), 0, 1)
+
+
+def crop(panels, view):
+    """The square around the object where the view has a mask, else the whole."""
+    if not view.masked:
+        return panels
+    y, x = np.nonzero(view.pixels[..., 3])
+    height, width = view.pixels.shape[:2]
+    side = min(height, width, round(1.06 * max(np.ptp(x), np.ptp(y))) + 2)
+    left, top = (int(np.clip((v.min() + v.max() - side) // 2, 0, n - side)) for v, n in ((x, width), (y, height)))
+    return {name: image[top:top + side, left:left + side] for name, image in panels.items()}
+
+
+def tone_map(radiance: np.ndarray) -> np.ndarray:
+    """Linear radiance to display values: Reinhard's curve, white at the 99.5th percentile, then sRGB."""
+    white = max(float(np.percentile(radiance, 99.5)), 1.0)
+    x = np.maximum(radiance, 0)
+    return srgb_encode(np.clip(x * (1 + x / white**2) / (1 + x), 0, 1))
+
+
 # ---- The contact sheet ----
 
-def contact_sheet(path, rows, environment: np.ndarray, background, title: str, lines):
-    """One picture of the fit: a row for each (view, `Rendering`) of ``rows``, cropped to the object; below them the
-    ``environment`` [rows, columns, 3] and beside it ``lines`` of text."""
-    rows = [crop(_panels(view, rendering, background), view) for view, rendering in rows]
-    names = list(dict.fromkeys(name for row in rows for name in row))
+def contact_sheet(path, rows, environment: np.ndarray, title: str, lines):
+    """One picture of the fit: a row for each view's `panels` of ``rows``; below them the ``environment``
+    [rows, columns, 3] and beside it ``lines`` of text."""
+    names = [name for name in _ON_SHEET if any(name in row for row in rows)]
     step, line = _PANEL + _GAP, round(1.6 * _TEXT)
     heights = [round(_PANEL * image.shape[0] / image.shape[1]) for image in (row["photograph"] for row in rows)]
     width = 2 * _MARGIN + len(names) * step - _GAP
@@ -70,40 +140,6 @@ def contact_sheet(path, rows, environment: np.ndarray, background, title: str, l
         draw.text((2 * map_height + 3 * _MARGIN, below + line + 1.5 * k * line), text, _INK, large)
     with atomic_file(path) as stream:
         sheet.save(stream, "PNG")
-
-
-def crop(panels, view):
-    """The square around the object where the view has a mask, else the whole."""
-    if not view.masked:
-        return panels
-    y, x = np.nonzero(view.pixels[..., 3])
-    height, width = view.pixels.shape[:2]
-    side = min(height, width, round(1.06 * max(np.ptp(x), np.ptp(y))) + 2)
-    left, top = (int(np.clip((v.min() + v.max() - side) // 2, 0, n - side)) for v, n in ((x, width), (y, height)))
-    return {name: image[top:top + side, left:left + side] for name, image in panels.items()}
-
-
-def tone_map(radiance: np.ndarray) -> np.ndarray:
-    """Linear radiance to display values: Reinhard's curve, white at the 99.5th percentile, then sRGB."""
-    white = max(float(np.percentile(radiance, 99.5)), 1.0)
-    x = np.maximum(radiance, 0)
-    return srgb_encode(np.clip(x * (1 + x / white**2) / (1 + x), 0, 1))
-
-
-def _panels(view, rendering, background):
-    """name -> display values [H, W, 3] over white, in the order of the sheet's columns."""
-    alpha, maps = rendering.alpha, rendering.maps
-    over_white = lambda premultiplied: premultiplied + (1 - alpha)
-    mean = lambda name: maps[name] / np.maximum(alpha, 1e-6)
-    light = lambda name: over_white(srgb_encode(np.clip(mean(name), 0, 1)) * alpha)
-    panels = {"photograph": photograph(view, background), "rendering": rendering.image,
-              "normals": over_white((maps["normal"] + alpha) / 2)}
-    if view.normal is not None:
-        known = np.linalg.norm(view.normal, axis=-1, keepdims=True) > 0.5
-        panels["true normals"] = np.where(known, view.normal / 2 + 0.5, 1)
-    return panels | {"roughness": over_white(maps["roughness"]).repeat(3, -1),
-                     "metallic": over_white(maps["metallic"]).repeat(3, -1), "base color": light("base_color"),
-                     "diffuse": light("diffuse"), "specular": light("specular")}
 
 
 def _paste(sheet, image, corner, size):

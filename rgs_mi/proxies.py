@@ -32,7 +32,7 @@ def quads(corners):
 
 class Proxies:
     """Where the surfels were when this was built, for rays to meet: each as the quad in which its alpha exceeds a
-    ``solid`` threshold.
+    ``solid`` threshold; only those in the ``box``, where there is one.
 
       scene      what rays meet: surfel number i is triangles 2 i and 2 i + 1
       extent     half the width of each quad, in standard deviations, ``mi.Float``
@@ -40,9 +40,11 @@ class Proxies:
       clearance  how far above the surface rays start, world units, ``mi.Float`` of width 1
     """
 
-    def __init__(self, surfels: Surfels, solid=_SOLID):
+    def __init__(self, surfels: Surfels, solid=_SOLID, box=None):
         with dr.suspend_grad():
             opacity = surfels.column(mi.Float, "opacities")
+            if box is not None:
+                opacity = dr.select(box.holds(surfels.column(mi.Point3f, "centers")), opacity, 0)
             self.extent = dr.sqrt(2 * dr.log(dr.maximum(opacity / solid, 1)))
             positions, faces = quads(corners(surfels, self.extent))
             self.normal = surfels.frames()[2]

@@ -42,11 +42,12 @@ class Met:
 
 
 class SurfelRays:
-    """``surfels`` as rays meet them; not differentiated. Its functions may be called within symbolic loops."""
+    """``surfels`` as rays meet them, those in the ``box`` where there is one; not differentiated. Its functions may be
+    called within symbolic loops."""
 
-    def __init__(self, surfels: Surfels):
+    def __init__(self, surfels: Surfels, box=None):
         with dr.suspend_grad():
-            self.proxies = Proxies(surfels, _CUTOFFS.alpha_min)
+            self.proxies = Proxies(surfels, _CUTOFFS.alpha_min, box)
             column = surfels.column
             self.shape = pack([column(mi.Float, "opacities"), self.proxies.extent, *self.proxies.normal])
             self.material = pack([*column(mi.Vector3f, "delta_normal"), *column(mi.Color3f, "base_color"),

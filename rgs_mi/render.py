@@ -1,27 +1,33 @@
-"""Pictures of a fitted scene from its own views or from a turntable, through ``mi.load_file`` and ``mi.render``."""
+"""Pictures and videos of a fitted scene from its own views, along them or from a turntable, through ``mi.load_file`` and
+``mi.render``."""
 
 import sys
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.spatial.transform import Rotation, RotationSpline
 
+from . import video
 from .camera import Camera
 from .color import srgb_encode
 from .errors import UserError
 from .export import SCENE, write_exr
 from .load import load_scene, surfels_of
 from .pictures import write_png
+from .priors.hull import looked_at
 from .progress import Progress
 from .relight import edit, relight
 from .shading.environment import Environment
 
 _PASS = 16  # samples per pixel at a time
+_MOST = 10_000  # frames
 AOVS = ("albedo", "roughness", "metallic", "normal", "depth", "diffuse", "specular", "alpha")
 
 
-def render_scene(path, *, variables=None, view=None, turntable=None, size=None, spp=1, out=None, aovs=False, envmap=None,
-                 rotate=0.0, changes=(), quiet=False) -> list[Path]:
+def render_scene(path, *, variables=None, view=None, turntable=None, along=None, filmed=False, size=None, spp=1, out=None,
+                 aovs=False, envmap=None, rotate=0.0, changes=(), quiet=False) -> list[Path]:
     """Render a scene of surfels into PNGs with straight alpha, and return their paths.
 
     Args:
@@ -30,15 +36,26 @@ def render_scene(path, *, variables=None, view=None, turntable=None, size=None, 
       view:      a sensor, by its id or number (default: the first)
       turntable: instead of a view, that many frames of a camera that circles the object about the environment's
                  up axis, at the sensors' mean distance and elevation
+      along:     instead of a view, that many frames of a camera that moves from sensor to sensor in their order, which for
+                 a run is that of its test views (0: the sensors themselves)
+      filmed:    whether to write the frames as a video and a contact sheet, too (`video.write`)
       size:      width in pixels (default: the sensor's); the height follows
       spp:       samples per pixel; a square number for 'rgs_deferred'
-      out:       a folder, or a PNG for a single view (default: ``renders`` or ``turntable`` beside the scene)
+      out:       a folder, or a PNG for a single view (default: ``renders``, ``turntable`` or ``path`` beside the scene)
       aovs:      whether to write ``NAME.exr`` as well: radiance, alpha and the G-buffer, float32
       envmap, rotate: another light, and the degrees by which light is turned (`relight`)
       changes:   materials to set (`relight.edit`)
 
     Raises: UserError for bad input and where a file can't be written.
     """
+    moves = turntable is not None or along is not None
+    for option, count, least in (("--turntable", turntable, 1), ("--path", along, 0)):
+        if count is not None and not least <= count <= _MOST:
+            raise UserError(f"{option} {count}: needs {least} to {_MOST} frames")
+    if filmed:
+        if not moves:
+            raise UserError("--video: one view makes no video: add --turntable N or --path")
+        video.check()
     path = Path(path)
     path = path / SCENE if path.is_dir() else path
     scene = load_scene(path, variables or {})
@@ -51,8 +68,9 @@ def render_scene(path, *, variables=None, view=None, turntable=None, size=None, 
                   "fit with -D diffuse=lit to relight all of it", file=sys.stderr)
     if changes:
         edit(scene, path, changes)
-    cameras = _circle(scene, path, turntable) if turntable else _view(scene, path, view)
-    out = Path(out) if out else path.parent / ("turntable" if turntable else "renders")
+    cameras = _circle(scene, path, turntable) if turntable else _along(scene, path, along) if moves else \
+        _view(scene, path, view)
+    out = Path(out) if out else path.parent / ("turntable" if turntable else "path" if moves else "renders")
     integrator = with_aovs(scene, path) if aovs else scene.integrator()
     written = []
     with Progress(None, quiet or len(cameras) == 1 and spp <= _PASS, "rendering") as progress:
@@ -60,13 +78,13 @@ def render_scene(path, *, variables=None, view=None, turntable=None, size=None, 
             step = lambda part: progress.update((k + part) / len(cameras))
             if size:
                 camera = camera.resized(size, max(1, round(size * camera.size[1] / camera.size[0])))
-            file = out if out.suffix == ".png" and not turntable else out / f"{name}.png"
+            file = out if out.suffix == ".png" and not moves else out / f"{name}.png"
             image = _render(scene, mi.load_dict(sensor_dict(camera)), integrator, spp, step)
             write_png(file, straight(image))
             if aovs:
                 write_exr(file.with_suffix(".exr"), image, ["R", "G", "B", "A", *integrator.aov_names()])
             written.append(file)
-    return written
+    return written + (video.write(out, written) if filmed else [])
 
 
 def _render(scene, sensor, integrator, spp, progress):
@@ -125,11 +143,33 @@ def _circle(scene, path, frames):
     return circle
 
 
+def _along(scene, path, frames):
+    """{sensor's id: camera} of all sensors, or {'000': camera, …} on a smooth path through them, about the point that they
+    look at; of one size."""
+    cameras = [Camera.from_sensor(sensor) for sensor in scene.sensors()]
+    size = cameras[0].size
+    cameras = [camera.resized(*size) for camera in cameras]
+    if not frames:
+        return dict(zip([sensor.id() for sensor in scene.sensors()], cameras))
+    if len(cameras) < 2:
+        raise UserError(f"{path}: has one sensor, which is no path: use --turntable")
+    center, _ = looked_at(cameras)
+    knots, times = np.arange(len(cameras)), np.linspace(0, len(cameras) - 1, frames)
+    through = lambda values: PchipInterpolator(knots, values)(times)
+    rotations = RotationSpline(knots, Rotation.from_matrix([c.to_world[:3, :3] for c in cameras]))(times).as_matrix()
+    seen = through([c.rotation @ (center - c.origin) for c in cameras])  # the centre in camera space
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rotations, center - np.einsum("kij,kj->ki", rotations, seen)
+    focal, principal = (through([getattr(c, name) for c in cameras]) for name in ("focal", "principal"))
+    return {f"{k:03}": Camera(poses[k], tuple(focal[k]), tuple(principal[k]), size) for k in range(frames)}
+
+
 def with_aovs(scene, path):
     """The scene's integrator with all its AOVs. Raises: UserError for one of another type."""
     own = scene.integrator()
     if not hasattr(own, "aov_names") or not hasattr(own, "specular"):
         raise UserError(f"{path}: maps come from the integrator 'rgs_deferred' only: leave out --aovs")
+    box = {"box": str(own.box)} if own.box else {}
     kept = ("specular", "diffuse", "samples", "indirect", "hide_emitters")
-    return mi.load_dict({"type": "rgs_deferred", "shader": own.shader_file, "aovs": ",".join(AOVS)}
+    return mi.load_dict({"type": "rgs_deferred", "shader": own.shader_file, "aovs": ",".join(AOVS)} | box
                         | {name: getattr(own, name) for name in kept})

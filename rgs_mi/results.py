@@ -1,4 +1,4 @@
-"""What a run leaves behind: metrics.json, the scene, pictures of the test views, a contact sheet, a summary."""
+"""What a run leaves behind: metrics.json, the scene, pictures of the test views, a contact sheet, a report, a summary."""
 
 import json
 import os
@@ -11,13 +11,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from . import __version__, checkpoint, evaluate, lpips, pictures
+from . import __version__, checkpoint, evaluate, lpips, pictures, report
 from .config import to_dict
 from .export import export
 from .progress import Progress
 
 METRICS, SHEET, GUIDED = "metrics.json", "contact_sheet.png", "guided.png"
-SHOWN = 4  # test views on the sheet, and with their G-buffers written
+SHOWN = 4  # test views on the sheet and in the report, and with their G-buffers written
 _NO_LPIPS = f"not measured, for want of weights: {lpips.INSTALL}"
 
 
@@ -27,15 +27,25 @@ def write(fit, scene, folder, quiet):
     Where nothing was held out, pictures show training views and the figures of quality are null.
     Raises: UserError where the disk is full or the folder can't be written.
     """
-    held_out = bool(fit.dataset.test)
-    views = judged(fit.dataset)
-    background = fit.settings.background
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
         exported = export(folder, scene, surfels, environment, fit.shading, fit.settings.indirect,
-                          fit.model.shader(), views)
+                          fit.model.shader(), judged(fit.dataset))
         lighting = fit.lighting(surfels)
-    scores, rows = {}, []
+    mean, scores, rows = measure(surfels, lighting, fit.dataset, fit.settings.background, folder, quiet)
+    if (guided := fit.guided_picture()) is not None:
+        pictures.write_png(folder / GUIDED, guided / 255)
+    fit.curves.write(folder)
+    publish(folder, mean | _facts(fit) | {"views": scores}, fit.curves, rows, environment, exported)
+
+
+def measure(surfels, lighting, dataset, background, folder, quiet) -> tuple[dict, dict, dict]:
+    """Render the views of a `Dataset` that results are of, and write their pictures below ``folder``.
+
+    Args: see `evaluate.render_view`. Returns: the figures of quality and speed, means as metrics.json has them; its
+    ``views``, {name: scores}; and {name: `pictures.panels`} of those that are shown.
+    """
+    views, scores, rows = judged(dataset), {}, {}
     on_sheet = {view.name for view in shown(views)}
     with Progress(None, quiet, "evaluating") as progress:
         for k, view in enumerate(views):
@@ -43,18 +53,27 @@ def write(fit, scene, folder, quiet):
             pictures.write_view(folder / "test", view, rendering, background, gbuffer=view.name in on_sheet)
             scores[view.name] = evaluate.score(view, rendering, background)
             if view.name in on_sheet:
-                rows.append((view, rendering))
+                rows[view.name] = pictures.panels(view, rendering, background)
             progress.update((k + 1) / len(views))
-    if (guided := fit.guided_picture()) is not None:
-        pictures.write_png(folder / GUIDED, guided / 255)
+    if not dataset.test:
+        scores = {}
+    mean = evaluate.mean_scores(list(scores.values()))
+    reason = None if mean["lpips"] is not None else \
+        "not measured: no test views that are large enough" if lpips.installed() else _NO_LPIPS
     fps = evaluate.frames_per_second(surfels, lighting, [view.camera for view in views])
-    mean = evaluate.mean_scores(list(scores.values()) if held_out else [])
-    figures = _figures(fit, mean, fps) | {"views": scores if held_out else {}}
+    return mean | {"lpips_reason": reason, "render_fps": fps}, scores, rows
+
+
+def publish(folder, figures, curves, rows, environment, others=()):
+    """Write metrics.json, contact sheet and report into ``folder``, and print what came out and where it is, the paths
+    ``others`` among it. ``figures``: what metrics.json holds; ``curves``, ``rows``: see `report.write`."""
     with checkpoint.atomic_file(folder / METRICS) as stream:
         stream.write((json.dumps(figures, indent=1, default=str) + "\n").encode())
-    lines = _summary(figures)
-    pictures.contact_sheet(folder / SHEET, rows, environment.texels.numpy(), background, folder.resolve().name, lines)
-    print("\n".join([*lines, "", *map(str, (folder / SHEET, folder / METRICS, *exported, folder / "test"))]))
+    lines, texels = _summary(figures), environment.texels.numpy()
+    pictures.contact_sheet(folder / SHEET, list(rows.values()), texels, folder.resolve().name, lines)
+    report.write(folder, figures, curves, rows, texels)
+    print("\n".join([*lines, "", *map(str, (folder / report.REPORT, folder / SHEET, folder / METRICS, *others,
+                                           folder / "test"))]))
 
 
 def judged(dataset) -> list:
@@ -75,21 +94,25 @@ def finished(folder) -> bool:
         return False
 
 
-def _figures(fit, mean, fps) -> dict:
-    """What metrics.json says of the run as a whole."""
-    parameters = sum(fit.model.numpy(name).size for name in fit.model.optimizer.keys())
-    return mean | {
-        "lpips_reason": None if mean["lpips"] is not None
-        else "not measured: no test views that are large enough" if lpips.installed() else _NO_LPIPS,
-        "finished": fit.progress >= 1, "render_fps": fps, "train_seconds": fit.elapsed, "iterations": fit.step_number,
-        "surfels": len(fit.model), "parameters": parameters,
+def _facts(fit) -> dict:
+    """What metrics.json says of the run as a whole, beside `measure`."""
+    return {
+        "finished": fit.progress >= 1, "train_seconds": fit.elapsed, "iterations": fit.step_number,
+        "surfels": len(fit.model), "parameters": sum(fit.model.numpy(name).size for name in fit.model.optimizer.keys()),
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "train_views": len(fit.dataset.train), "test_views": len(fit.dataset.test),
-        "settings": to_dict(fit.settings),
+        "photographs": str(fit.dataset.root.resolve()), "settings": to_dict(fit.settings), **circumstances(),
+    }
+
+
+def circumstances() -> dict:
+    """With what, where and by which command this process runs, as metrics.json has it."""
+    return {
         "versions": {"rgs_mi": __version__, "mitsuba": mi.__version__, "drjit": dr.__version__,
                      "python": platform.python_version()},
         "machine": {"cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-                    "processor": platform.machine(), "system": platform.system(), "variant": mi.variant()},
+                    "threads": dr.thread_count(), "processor": platform.machine(), "system": platform.system(),
+                    "variant": mi.variant()},
         "command": shlex.join(sys.argv),
     }
 

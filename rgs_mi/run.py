@@ -4,15 +4,18 @@ import shutil
 import sys
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from . import checkpoint, results
+from .box import Box
 from .config import completed, to_dict
 from .errors import UserError
+from .events import Events
 from .fit import Fit
-from .initial import initial_points
+from .initial import initial_points, surroundings
 from .interrupt import GracefulInterrupt
 from .model import Model
 from .priors import depth_priors
@@ -21,11 +24,12 @@ from .scene import FitScene
 from .settings import Settings
 
 _PRIORS = Path("data") / "priors"  # what is known of depths is kept here, below the current folder
+_ON_HULL, _ELSEWHERE = 0.7, 0.1  # opacities to start with; where surfels fill space, more would hide what is within
 _SMOOTHING = 0.95  # of the PSNR that the progress line shows
 
 
 def optimize(path, *, data=None, variables=None, config=None, overrides=(), minutes=None, seed=None, out=None,
-             resume=False, quiet=False) -> Path:
+             resume=False, quiet=False, tensorboard=False) -> Path:
     """Fit the scene at ``path`` and write the run's folder, which is returned.
 
     Args:
@@ -33,8 +37,9 @@ def optimize(path, *, data=None, variables=None, config=None, overrides=(), minu
       config, overrides, minutes, seed: the settings, each over the former (see `FitScene.settings`)
       out:     the run's folder (default: runs/NAME)
       resume:  go on from the newest checkpoint in ``out``
+      tensorboard: write event files into the folder's ``tensorboard``
 
-    Raises: UserError for bad input, a folder that can't be written, and a fit that diverges.
+    Raises: UserError for bad input, a package that is missing, a folder that can't be written, and a fit that diverges.
     """
     scene = FitScene.load(path, data, variables)
     overrides = [*overrides, *([f"minutes={minutes}", "iterations=null"] if minutes is not None else []),
@@ -42,9 +47,10 @@ def optimize(path, *, data=None, variables=None, config=None, overrides=(), minu
     settings = scene.settings(config, overrides)
     folder = Path(out) if out else Path("runs") / scene.name
     saved = _saved(folder, resume)
+    events = Events(folder / "tensorboard", saved[1]["step"] if saved else 0) if tensorboard else None
     dataset = scene.dataset(quiet)
     fit = _resume(saved, scene, dataset, settings) if saved else start(scene, dataset, settings)
-    stopped = _loop(fit, folder, quiet)
+    stopped = _loop(fit, folder, quiet, events)
     results.write(fit, scene, folder, quiet)
     if stopped:
         print(f"stopped at {100 * fit.progress:.0f}%; go on with the same command and --resume")
@@ -69,13 +75,42 @@ def _saved(folder, resume):
 
 def start(scene, dataset, settings) -> Fit:
     """A fit at its beginning."""
-    positions, normals, colors, spacing = initial_points(dataset, settings.start.surfels, settings.seed,
-                                                         settings.start.hull)
-    extent = float(np.linalg.norm(positions - positions.mean(0), axis=1).max())
+    points = initial_points(dataset, settings.start.surfels, settings.seed, settings.start.hull)
+    opacity = settings.start.opacity or (_ON_HULL if points[1] is not None else _ELSEWHERE)
+    shading = _shading(scene, dataset, settings)
+    if shading.box is None:
+        extent = float(np.linalg.norm(points[0] - points[0].mean(0), axis=1).max())
+    else:
+        extent = shading.box.radius
+        points = _with_surroundings(points, dataset, settings)
     light = scene.environment
-    model = Model.start(positions, normals, colors, spacing, light.texels.numpy(), light.rotation, settings.sh_order,
-                        settings.seed, settings.start.scale, settings.start.roughness, settings.shader)
-    return Fit(dataset, model, settings, extent, scene.shading, _priors(dataset, settings))
+    model = Model.start(*points, light.texels.numpy(), light.rotation, settings.sh_order, settings.seed,
+                        settings.start.scale, opacity, settings.start.roughness, settings.shader,
+                        two_sided=None if shading.box is None else True)
+    return Fit(dataset, model, settings, extent, shading, _priors(dataset, settings))
+
+
+def _with_surroundings(points, dataset, settings):
+    """`initial_points` of the object and whatever else photographs show, and those of what lies farther away."""
+    positions, _, colors, spacing = points
+    normals = np.random.default_rng((settings.seed, 2)).normal(size=positions.shape)
+    near = positions, normals / np.linalg.norm(normals, axis=1, keepdims=True), colors, spacing
+    far = surroundings(dataset, settings.start.surroundings, settings.seed)
+    return [np.concatenate(pair) for pair in zip(near, far)]
+
+
+def _shading(scene, dataset, settings):
+    """How the scene is shaded: in the box around the object where photographs have no masks.
+
+    Raises: UserError for a box that is none.
+    """
+    try:
+        box = None if settings.box is None else Box.of(settings.box)
+    except ValueError as error:
+        raise UserError(f"settings: box {list(settings.box)}: {error}") from error
+    if box is None and not any(view.masked for view in dataset.train):
+        box = Box.seen_by([view.camera for view in dataset.train])
+    return replace(scene.shading, box=box)
 
 
 def _priors(dataset, settings):
@@ -97,7 +132,8 @@ def _resume(saved, scene, dataset, settings) -> Fit:
     if changed:
         listing = ", ".join(f"{key} {old.get(key)} -> {new[key]}" for key in changed)
         print(f"settings differ from the checkpoint's, the new ones hold: {listing}", file=sys.stderr)
-    return Fit.resume(dataset, settings, arrays, meta, shading=scene.shading, priors=_priors(dataset, settings))
+    return Fit.resume(dataset, settings, arrays, meta, shading=_shading(scene, dataset, settings),
+                      priors=_priors(dataset, settings))
 
 
 def _photographs(dataset) -> list:
@@ -115,7 +151,7 @@ def _flat(tree, prefix="") -> dict:
 
 # ---- Loop ----
 
-def _loop(fit, folder, quiet) -> bool:
+def _loop(fit, folder, quiet, events=None) -> bool:
     """Step until the budget is spent or someone interrupts; returns whether someone did. Begins and ends with a
     checkpoint: a folder that can't be written is known before the work, not after it."""
     settings, psnr = fit.settings, None
@@ -126,12 +162,14 @@ def _loop(fit, folder, quiet) -> bool:
     with GracefulInterrupt() as interrupt, Progress(planned, quiet) as progress:
         while fit.progress < 1 and not interrupt.requested:
             before = fit.elapsed
-            fit.step()
+            recorded = fit.step()
             if not np.isfinite(fit.psnr):
                 raise _diverged(fit, folder)
             psnr = fit.psnr if psnr is None else _SMOOTHING * psnr + (1 - _SMOOTHING) * fit.psnr
             progress.update(fit.progress, psnr=psnr, surfels=len(fit.model), ms=1e3 * (fit.elapsed - before),
-                            pixels=fit.dataset.train[0].camera.size[0] // fit.stage.downscale)
+                            pixels=fit.pixels)
+            if events and recorded:
+                events.add(fit.curves.rows[-1])
             if time.monotonic() - saved > settings.checkpoint_seconds:
                 state = _state(fit, folder)
                 try:

@@ -24,7 +24,9 @@ class Start:
     surfels: int = _within(25_000, 1, 10_000_000)
     hull: bool = True  # on the visual hull, where photographs have masks; else on the data set's points, or at random
     scale: float = _within(0.8, 0.01, 10)  # standard deviation over the distance to the neighbours
+    opacity: float | None = _within(None, 0.001, 0.999)  # unless given: 0.7 on the hull, 0.1 elsewhere (3DGS)
     roughness: float = _within(0.3, 0, 1)
+    surroundings: int = _within(5_000, 0, 1_000_000)  # more surfels far away, where photographs have no masks
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,9 @@ class Settings:
     seed: int = _within(0, 0, 2**31)
     background: float = _within(1.0, 0, 1)  # display grey level behind masked objects, in training and in figures
     specular_start: float = _within(0.0, 0, 1)  # fraction of the fit from which reflections are shaded; 1: never
+    # Lower and upper corner of the box around the object, in captures without masks: what reflects. Unless given, it is
+    # half as far from the point that the cameras look at as the nearest of them
+    box: tuple[float, float, float, float, float, float] | None = None
     reflective: float = _within(0.9, 0, 1)  # the fraction of a view's foreground, smoothest first, that is reflective
     shader: Literal["identity", "mlp"] = "identity"  # f_φ of C = C_d + f_φ(C_s): nothing, or a tiny network trained along
     indirect: Literal["none", "visibility", "one_bounce"] = "one_bounce"  # what reflected rays that meet surfels bring

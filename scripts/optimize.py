@@ -23,6 +23,7 @@ def main():
     parser.add_argument("--resume", action="store_true", help="go on from the run's newest checkpoint")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
     parser.add_argument("--seed", type=int, help="of everything random")
+    parser.add_argument("--tensorboard", action="store_true", help="write event files into the run's folder tensorboard/")
     parser.add_argument("--quiet", action="store_true", help="no progress")
     args = parser.parse_args()
 
@@ -31,7 +32,7 @@ def main():
 
     optimize(args.scene, data=args.data, variables=parse_variables(args.define), config=args.config,
              overrides=args.overrides, minutes=args.minutes, seed=args.seed, out=args.out, resume=args.resume,
-             quiet=args.quiet)
+             quiet=args.quiet, tensorboard=args.tensorboard)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 #!/usr/bin/env python
-"""Render a fitted scene from one of its views, or from a turntable; under another light or with another material."""
+"""Render a fitted scene from one of its views, along them or from a turntable; under another light or with another
+material."""
 
 import argparse
 from pathlib import Path
@@ -16,6 +17,10 @@ def main():
     views = parser.add_mutually_exclusive_group()
     views.add_argument("--view", metavar="NAME|INDEX", help="a sensor of the scene (default: the first)")
     views.add_argument("--turntable", type=int, metavar="N", help="N frames around the object")
+    views.add_argument("--path", type=int, nargs="?", const=0, metavar="N", help="all views in their order, a run's test "
+                       "views; or N frames of a camera that moves from one to the next")
+    parser.add_argument("--video", action="store_true", help="make the frames a video, too, and a contact sheet; needs "
+                        "`pip install imageio-ffmpeg`")
     parser.add_argument("--size", type=int, metavar="W", help="width in pixels (default: the sensor's)")
     parser.add_argument("--spp", type=int, default=1, help="samples per pixel; for surfels alone a square number "
                         "(default: %(default)s)")
@@ -33,8 +38,8 @@ def main():
     rgs_mi.set_variant(args.variant)
     from rgs_mi.render import render_scene
 
-    for path in render_scene(args.scene, variables=parse_variables(args.define), view=args.view,
-                             turntable=args.turntable, size=args.size, spp=args.spp, out=args.out, aovs=args.aovs,
+    for path in render_scene(args.scene, variables=parse_variables(args.define), view=args.view, turntable=args.turntable,
+                             along=args.path, filmed=args.video, size=args.size, spp=args.spp, out=args.out, aovs=args.aovs,
                              envmap=args.envmap, rotate=args.rotate, changes=args.changes, quiet=args.quiet):
         print(path)
 

@@ -1,4 +1,5 @@
 import pytest
+from runs import make_inputs
 
 import rgs_mi
 
@@ -7,3 +8,10 @@ import rgs_mi
 def variant():
     """Every test runs in the variant that the package is for; a test that changes it is put right again."""
     rgs_mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture(scope="session")
+def inputs(tmp_path_factory):
+    """(scene to fit, its photographs) of `runs.make_inputs`, which no test changes."""
+    rgs_mi.set_variant()
+    return make_inputs(tmp_path_factory.mktemp("inputs"))

@@ -28,6 +28,13 @@ def make_inputs(folder: Path, size=32) -> tuple[Path, Path]:
     return folder / "object.xml", data
 
 
+def make_suite(scene: Path, data: Path, folder: Path, *names) -> tuple[Path, Path]:
+    """The photographs ``data`` as captures ``names`` in ``folder``: the scene to fit, and the captures' folder."""
+    for name in names:
+        (folder / name).symlink_to(data)
+    return scene, folder
+
+
 def start_script(name, *arguments) -> subprocess.Popen:
     """Start a script of the project in a process of its own."""
     return subprocess.Popen([sys.executable, str(ROOT / "scripts" / name), *map(str, arguments)], text=True,

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
-from runs import ROOT, TARGET, make_inputs, start_script
+from runs import ROOT, TARGET, make_suite, start_script
 
-from rgs_mi import ablate, apart, comparison, results
+from rgs_mi import ablate, apart, comparison, jobs, results
 from rgs_mi.config import completed, to_dict
 from rgs_mi.errors import UserError
 from rgs_mi.scene import FitScene
@@ -25,17 +25,9 @@ SMALL = ["iterations=6", "start.surfels=200", "stages=[{views: 2}]", "density.in
 
 
 @pytest.fixture(scope="module")
-def suite(tmp_path_factory):
+def suite(inputs, tmp_path_factory):
     """(scene to fit, folder of the captures 'one' and 'two')."""
-    import rgs_mi
-
-    rgs_mi.set_variant()
-    folder = tmp_path_factory.mktemp("suite")
-    scene, data = make_inputs(folder)
-    (folder / "captures").mkdir()
-    for name in ("one", "two"):
-        (folder / "captures" / name).symlink_to(data)
-    return scene, folder / "captures"
+    return make_suite(*inputs, tmp_path_factory.mktemp("suite"), "one", "two")
 
 
 @pytest.fixture
@@ -44,7 +36,7 @@ def inside(monkeypatch, tmp_path):
     fitted = []
 
     def call(function, *arguments):
-        fitted.extend(str(a.folder.relative_to(tmp_path)) for a in arguments if isinstance(a, ablate.Job))
+        fitted.extend(str(a.folder.relative_to(tmp_path)) for a in arguments if isinstance(a, jobs.Job))
         return function(*arguments)
 
     monkeypatch.chdir(tmp_path)  # where what is known of depths is kept
@@ -93,18 +85,18 @@ def test_leave_one_out_on_two_scenes(suite, tmp_path):
     scene, captures = suite
     for name in ("one", "two", "three"):
         (tmp_path / name).symlink_to(captures / "one")
-    jobs = ablate.plan(tmp_path, scene, out=tmp_path)
-    assert [job.scene for job in jobs if job.asked and job.variant == "no-depth"] == ["one", "three"]  # by name
-    jobs = ablate.plan(tmp_path, scene, variants=["no-depth"], out=tmp_path)
-    assert [job.scene for job in jobs if job.asked] == ["one", "three", "two"]
+    plan = ablate.plan(tmp_path, scene, out=tmp_path)
+    assert [job.scene for job in plan if job.asked and job.variant == "no-depth"] == ["one", "three"]  # by name
+    plan = ablate.plan(tmp_path, scene, variants=["no-depth"], out=tmp_path)
+    assert [job.scene for job in plan if job.asked] == ["one", "three", "two"]
 
 
 def test_scenes_are_found(tmp_path):
     (tmp_path / "ball.xml").write_text(TARGET)
     (tmp_path / "include").mkdir()
     (tmp_path / "include" / "setup.xml").write_text("<scene version='3.0.0'/>")
-    assert ablate.find_scenes(tmp_path) == {"ball": tmp_path / "ball.xml"}
-    assert list(ablate.find_scenes(ROOT / "scenes" / "targets")) == ["ball", "car", "coffee", "helmet", "teapot", "toaster"]
+    assert jobs.find_scenes(tmp_path) == {"ball": tmp_path / "ball.xml"}
+    assert list(jobs.find_scenes(ROOT / "scenes" / "targets")) == ["ball", "car", "coffee", "helmet", "teapot", "toaster"]
 
 
 @pytest.mark.parametrize("options, message", [
@@ -164,14 +156,14 @@ def test_failures_are_told(suite, tmp_path, inside, monkeypatch, capsys):
     (tmp_path / "suite" / "bad").mkdir(parents=True)
     (tmp_path / "suite" / "bad" / "transforms_train.json").write_text("{")
     (tmp_path / "suite" / "good").symlink_to(captures / "one")
-    optimize = ablate.optimize
+    optimize = jobs.optimize
 
     def explode(xml, **options):
         if "weights.depth=0" in options["overrides"]:
             raise UserError("out | of luck")
         return optimize(xml, **options)
 
-    monkeypatch.setattr(ablate, "optimize", explode)
+    monkeypatch.setattr(jobs, "optimize", explode)
     assert call((scene, tmp_path / "suite"), tmp_path / "out", variants=["no-depth", "full"]) == 3
     rows = {(r["scene"], r["variant"]): r for r in read(tmp_path / "out")["runs"]}
     assert [r["status"] for r in rows.values()] == ["failed", "failed", "finished", "failed"]
@@ -312,12 +304,12 @@ def test_means():
 def test_table_files(suite, tmp_path):
     """The files say what the runs say."""
     scene, captures = suite
-    jobs = ablate.plan(captures, scene, variants=["baseline", "rd"], out=tmp_path)
-    for k, job in enumerate(job for job in jobs if job.asked):
+    plan = ablate.plan(captures, scene, variants=["baseline", "rd"], out=tmp_path)
+    for k, job in enumerate(job for job in plan if job.asked):
         job.folder.mkdir(parents=True)
         figures = dict.fromkeys((*comparison.FIGURES, *comparison.DETAILS), k + 1.5)
         (job.folder / results.METRICS).write_text(json.dumps(figures | {"finished": True, "settings": job.settings}))
-    ablate._write(jobs, {jobs[1].folder: "an, error"}, tmp_path)
+    ablate._write(plan, {plan[1].folder: "an, error"}, tmp_path)
     with open(tmp_path / "ablation.csv", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [tuple(r[name] for name in ("scene", "variant", "psnr", "error")) for r in rows] == [

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
-from runs import make_inputs, start_script
+from runs import start_script
 
 from rgs_mi import checkpoint, losses
 from rgs_mi.errors import UserError
@@ -17,14 +17,6 @@ from rgs_mi.fit import Fit
 SMALL = ["iterations=20", "start.surfels=300", "checkpoint_seconds=0", "stages=[{views: 2}]"]
 SHOWN = ("psnr", "ssim", "lpips", "normal_mae_deg", "surfels", "iterations", "train_seconds", "render_fps",
          "peak_rss_mb")
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory):
-    import rgs_mi
-
-    rgs_mi.set_variant()
-    return make_inputs(tmp_path_factory.mktemp("inputs"))
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +104,7 @@ def test_shading_is_the_scenes(inputs, tmp_path, old, new):
 
 
 def test_photographs_without_masks(inputs, tmp_path):
-    """RGB files: the fit starts from random points."""
+    """RGB files: the fit starts from random points, and from surroundings; what is in a box reflects."""
     scene, data = inputs
     for path in data.glob("transforms_*.json"):
         (tmp_path / path.name).write_bytes(path.read_bytes())
@@ -123,12 +115,15 @@ def test_photographs_without_masks(inputs, tmp_path):
         white.convert("RGB").save(tmp_path / path.parent.name / path.name)
     process = start_script("optimize.py", scene, "--data", tmp_path, "--out", tmp_path / "run", "--quiet",
                            *(word for setting in [*SMALL, "iterations=30", "density.interval=10", "density.start=0",
-                                                  "sh_start=0.2"] for word in ("--set", setting)))
+                                                  "sh_start=0.2", "start.surroundings=100"] for word in ("--set", setting)))
     _, error = process.communicate(timeout=100)
     assert process.returncode == 0 and error == "", error
     figures = metrics(tmp_path / "run")
     assert figures["finished"] and figures["psnr"] > 8 and figures["normal_mae_deg"] is None
-    assert_renders_as_written(mi.load_file(str(tmp_path / "run" / "scene.xml")), tmp_path / "run")
+    scene = mi.load_file(str(tmp_path / "run" / "scene.xml"))
+    assert 1 < scene.integrator().box.radius < 6
+    assert np.linalg.norm(mi.traverse(scene)["object.centers"].numpy(), axis=1).max() > 10
+    assert_renders_as_written(scene, tmp_path / "run")
 
 
 def test_render(run, tmp_path):

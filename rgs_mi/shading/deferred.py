@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from ..box import Box
 from ..splat.gbuffer import render_gbuffer
 from ..splat.project import opaque
 from .indirect import Indirect
@@ -17,23 +18,27 @@ COVERED = 4e-3  # pixels with less alpha are left empty
 
 @dataclass(frozen=True)
 class Shading:
-    """How a scene is shaded, as its integrator (see `rgs_deferred`) and its surfels say."""
+    """How a scene is shaded, as its integrator (see `rgs_deferred`) and its surfels say; ``box``: where (None: all of
+    it)."""
 
     specular: str = "split_sum"
     diffuse: str = "radiance"
     samples: int = SAMPLES
     eta: float = DEFAULT_ETA
+    box: Box | None = None
 
 
 @dataclass
 class Lighting:
     """What surfels reflect, and how: the ``estimator`` of the BSDF's integrals; f_φ (None: the identity); each other (None:
-    not); ``lit``: whether their diffuse radiance, too, is that of their base colour under the light, and not their own."""
+    not); ``lit``: whether their diffuse radiance, too, is that of their base colour under the light, and not their own;
+    ``box``: where all this holds (None: everywhere), beyond it they have their own diffuse radiance alone."""
 
     estimator: SplitSum | MonteCarlo
     shader: Shader | None = None
     indirect: Indirect | None = None
     lit: bool = False
+    box: Box | None = None
 
     def specular(self, normal, view, roughness, metallic, base_color, point=None):
         """f_φ(C_s), radiance that surfaces reflect towards ``view``, ``mi.Color3f``; see `SplitSum.specular`. ``point``:
@@ -97,20 +102,34 @@ def shade(gbuffer, camera, lighting: Lighting | None) -> Image:
     return Image(diffuse + specular, diffuse, specular, gbuffer)
 
 
+def within(gbuffer, camera, box: Box | None):
+    """Which pixels are covered by what lies in ``box`` (None: by anything), ``mi.Bool``."""
+    alpha, depth = dr.detach(gbuffer.all.alpha), dr.detach(gbuffer.all.depth)
+    covered = alpha > COVERED
+    if box is None:
+        return covered
+    directions = pixel_directions(camera, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]))
+    return covered & box.holds(_points(camera, directions, depth / dr.maximum(alpha, COVERED)))
+
+
+def _points(camera, direction, depth):
+    """World-space points along unit ``direction`` at a ``depth`` (z)."""
+    rotation, origin, *_ = opaque(camera)
+    return origin + direction * (depth / (rotation @ direction).z)
+
+
 def _reflected(gbuffer, camera, lighting):
     """(C_d, f_φ(C_s)) times coverage, a lane a pixel. Only covered pixels are computed."""
-    pixels = camera.size[0] * camera.size[1]
-    diffuse = dr.zeros(mi.Color3f, pixels) if lighting.lit else gbuffer.all.diffuse
-    specular = dr.zeros(mi.Color3f, pixels)
-    index = dr.compress(dr.detach(gbuffer.all.alpha) > COVERED)
+    diffuse, specular = gbuffer.all.diffuse, dr.zeros(mi.Color3f, camera.size[0] * camera.size[1])
+    shaded = within(gbuffer, camera, lighting.box)
+    index = dr.compress(shaded)
+    if lighting.lit:
+        diffuse = dr.select(shaded, 0, diffuse)
     if dr.width(index) > 0:
         m = gbuffer.maps(index)
         mean = dr.rcp(m.alpha)
         normal, direction = dr.normalize(m.normal), pixel_directions(camera, index)
-        point = None
-        if lighting.indirect is not None:
-            rotation, origin, *_ = opaque(camera)
-            point = origin + direction * (m.depth * mean / (rotation @ direction).z)
+        point = None if lighting.indirect is None else _points(camera, direction, m.depth * mean)
         surfaces = normal, -direction, m.roughness * mean, m.metallic * mean, m.base_color * mean, point
         dr.scatter(specular, lighting.specular(*surfaces) * m.alpha, index)
         if lighting.lit:

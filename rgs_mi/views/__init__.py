@@ -56,13 +56,26 @@ def load_dataset(root: Path) -> Dataset:
     (`distortion.undistorted`, which keeps them below the current folder).
     Raises: UserError when the folder is missing, has no known layout, or when a file in it is bad.
     """
-    from . import blender, colmap, nerfstudio, nero
-
-    root, layouts = Path(root), (blender, nerfstudio, colmap, nero)
+    root = Path(root)
     if not root.is_dir():
         raise UserError(f"data folder '{root}' does not exist: give a capture's folder with --data")
-    for layout in layouts:
+    for layout in _layouts():
         if layout.found(root):
             return layout.load(root)
-    raise UserError(f"data folder '{root}' has no layout that is known: looked for "
-                    f"{'; '.join(layout.LOOKED_FOR for layout in layouts)}")
+    raise UserError(f"data folder '{root}' has no layout that is known: looked for {looked_for()}")
+
+
+def is_capture(root: Path) -> bool:
+    """Whether ``root`` is a folder with one of the layouts of `load_dataset`; what is in its files is not asked."""
+    return root.is_dir() and any(layout.found(root) for layout in _layouts())
+
+
+def looked_for() -> str:
+    """The files that tell a capture, in words."""
+    return "; ".join(layout.LOOKED_FOR for layout in _layouts())
+
+
+def _layouts():
+    from . import blender, colmap, nerfstudio, nero
+
+    return blender, nerfstudio, colmap, nero
