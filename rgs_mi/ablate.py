@@ -59,6 +59,8 @@ VARIANTS = {
     "rd": Variant("+ RD", "deferred2dgs", RD),
     "full": Variant("full: + CSCR + RD", "deferred2dgs", CSCR + RD),
     "fast": Variant("fast: the defaults", "fast"),
+    "lean": Variant("full, at most 24 000 surfels", "deferred2dgs",
+                    (*CSCR, *RD, "start.surfels=16000", "density.max_surfels=24000"), "baseline", 2),
     "paper": Variant("full, multi-view steps (MVGS)", "paper", (), "full", 2),
     "no-indirect": Variant("fast, reflections of the light alone", "fast", ("indirect=none",), "fast", 2),
     "no-depth": Variant("full, no depth prior", "deferred2dgs", (*CSCR, *RD, "weights.depth=0"), "full", 2),

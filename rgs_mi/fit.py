@@ -108,6 +108,12 @@ class Fit:
         s = self.settings
         return self._reflects and s.indirect != "none" and self.progress >= s.indirect_start
 
+    @property
+    def begun(self) -> tuple[Shading, str]:
+        """How the model is shaded by now: the `Shading` and ``indirect`` of a scene that renders the same."""
+        specular = "none" if not self._reflects else "monte_carlo" if self._samples_light else "split_sum"
+        return replace(self.shading, specular=specular), self.settings.indirect if self._sees_itself else "none"
+
     def lighting(self, surfels, training=False) -> deferred.Lighting | None:
         """How the model's ``surfels`` are shaded: None where nothing specular is, or not yet. ``training``: as a step has
         it, with what reflected rays meet, and the light's sampling, of some steps ago."""

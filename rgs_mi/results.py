@@ -29,8 +29,8 @@ def write(fit, scene, folder, quiet):
     """
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
-        exported = export(folder, scene, surfels, environment, fit.shading, fit.settings.indirect,
-                          fit.model.shader(), judged(fit.dataset))
+        exported = export(folder, scene, surfels, environment, *fit.begun, fit.model.shader(),
+                          judged(fit.dataset))
         lighting = fit.lighting(surfels)
     mean, scores, rows = measure(surfels, lighting, fit.dataset, fit.settings.background, folder, quiet)
     if (guided := fit.guided_picture()) is not None:

@@ -236,3 +236,16 @@ def test_progress_and_bands_of_harmonics(dataset):
         fit.elapsed = elapsed
         orders.append(fit.sh_order)
     assert orders == [0, 0, 1, 2, 2, 2] and fit.progress == 1
+
+
+def test_a_fit_that_is_stopped_is_shaded_by_what_has_begun(dataset):
+    settings = replace(SETTINGS, iterations=100, specular_start=0.2, indirect="one_bounce", indirect_start=0.4,
+                       monte_carlo_start=0.6)
+    fit, begun = Fit(dataset, model(), settings, 1.0, Shading("monte_carlo")), []
+    for fit.step_number in (10, 30, 50, 70):
+        shading, indirect = fit.begun
+        begun.append((shading.specular, indirect))
+        lighting = fit.lighting(fit.model.surfels(0))
+        assert (lighting is None) == (shading.specular == "none")
+        assert (lighting is not None and lighting.indirect is not None) == (indirect != "none")
+    assert begun == [("none", "none"), ("split_sum", "none"), ("split_sum", "one_bounce"), ("monte_carlo", "one_bounce")]
