@@ -156,13 +156,14 @@ def write_colmap(root, images, model="PINHOLE", parameters=(*FOCAL, *PRINCIPAL),
 
 
 def write_nero(root, images, depths=None, protocol=4):
-    """``depths``: [H, W] in units, one for all."""
+    """``depths``: [H, W] in units, one for all, or one each."""
     matrix = np.array([[FOCAL[0], 0, PRINCIPAL[0]], [0, FOCAL[1], PRINCIPAL[1]], [0, 0, 1]])
     for i, (pose, pixels) in enumerate(zip(poses(len(images)), images.values())):
         (root / f"{i}-camera.pkl").write_bytes(pickle.dumps([np.linalg.inv(pose)[:3], matrix], protocol))
         save(root / f"{i}.png", pixels)
         if depths is not None:
-            write_png16(root / f"{i}-depth.png", np.rint(np.clip(depths / 15, 0, 1) * 65535))
+            depth = np.broadcast_to(depths, (len(images), *SIZE[::-1]))[i]
+            write_png16(root / f"{i}-depth.png", np.rint(np.clip(depth / 15, 0, 1) * 65535))
     return root
 
 
