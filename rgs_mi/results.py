@@ -27,6 +27,7 @@ def write(fit, scene, folder, quiet):
     Where nothing was held out, pictures show training views and the figures of quality are null.
     Raises: UserError where the disk is full or the folder can't be written.
     """
+    facts = _facts(fit)  # the peak of memory is the fit's, not of judging it
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
         exported = export(folder, scene, surfels, environment, *fit.begun, fit.model.shader(),
@@ -36,7 +37,7 @@ def write(fit, scene, folder, quiet):
     if (guided := fit.guided_picture()) is not None:
         pictures.write_png(folder / GUIDED, guided / 255)
     fit.curves.write(folder)
-    publish(folder, mean | _facts(fit) | {"views": scores}, fit.curves, rows, environment, exported)
+    publish(folder, mean | facts | {"views": scores}, fit.curves, rows, environment, exported)
 
 
 def measure(surfels, lighting, dataset, background, folder, quiet) -> tuple[dict, dict, dict]:

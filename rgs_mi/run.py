@@ -24,7 +24,7 @@ from .scene import FitScene
 from .settings import Settings
 
 _PRIORS = Path("data") / "priors"  # what is known of depths is kept here, below the current folder
-_ON_HULL, _ELSEWHERE = 0.7, 0.1  # opacities to start with; where surfels fill space, more would hide what is within
+_ON_SURFACE, _ANYWHERE = 0.7, 0.1  # opacities to start with; where surfels fill space, more would hide what is within
 _SMOOTHING = 0.95  # of the PSNR that the progress line shows
 
 
@@ -76,7 +76,8 @@ def _saved(folder, resume):
 def start(scene, dataset, settings) -> Fit:
     """A fit at its beginning."""
     points = initial_points(dataset, settings.start.surfels, settings.seed, settings.start.hull)
-    opacity = settings.start.opacity or (_ON_HULL if points[1] is not None else _ELSEWHERE)
+    random = points[1] is None and not (dataset.points is not None and len(dataset.points))
+    opacity = settings.start.opacity or (_ANYWHERE if random else _ON_SURFACE)
     shading = _shading(scene, dataset, settings)
     if shading.box is None:
         extent = float(np.linalg.norm(points[0] - points[0].mean(0), axis=1).max())

@@ -24,7 +24,7 @@ class Start:
     surfels: int = _within(25_000, 1, 10_000_000)
     hull: bool = True  # on the visual hull, where photographs have masks; else on the data set's points, or at random
     scale: float = _within(0.8, 0.01, 10)  # standard deviation over the distance to the neighbours
-    opacity: float | None = _within(None, 0.001, 0.999)  # unless given: 0.7 on the hull, 0.1 elsewhere (3DGS)
+    opacity: float | None = _within(None, 0.001, 0.999)  # unless given: 0.1 at random points, else 0.7
     roughness: float = _within(0.3, 0, 1)
     surroundings: int = _within(5_000, 0, 1_000_000)  # more surfels far away, where photographs have no masks
 

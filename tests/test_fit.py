@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
@@ -14,6 +15,7 @@ from rgs_mi.fit import Fit
 from rgs_mi.model import Model
 from rgs_mi.photographs import Photographs
 from rgs_mi.priors import DepthPrior
+from rgs_mi.run import start
 from rgs_mi.settings import Density, Rates, Settings, Stage, Start, Weights
 from rgs_mi.shading import deferred
 from rgs_mi.shading.deferred import Shading
@@ -249,3 +251,15 @@ def test_a_fit_that_is_stopped_is_shaded_by_what_has_begun(dataset):
         assert (lighting is None) == (shading.specular == "none")
         assert (lighting is not None and lighting.indirect is not None) == (indirect != "none")
     assert begun == [("none", "none"), ("split_sum", "none"), ("split_sum", "one_bounce"), ("monte_carlo", "one_bounce")]
+
+
+@pytest.mark.parametrize("where, opacity", [("hull", 0.7), ("points", 0.7), ("anywhere", 0.1)])
+def test_opacities_to_start_with(dataset, where, opacity):
+    points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    data = replace(dataset, points=points if where == "points" else None)
+    scene = SimpleNamespace(shading=Shading(), environment=model().environment())
+    settings = replace(SETTINGS, start=Start(surfels=50, hull=where == "hull"), weights=Weights(depth=0))
+    surfels = start(scene, data, settings).model.surfels(0)
+    np.testing.assert_allclose(surfels.opacities.numpy(), opacity, rtol=1e-5)
+    settings = replace(settings, start=replace(settings.start, opacity=0.4))
+    np.testing.assert_allclose(start(scene, data, settings).model.surfels(0).opacities.numpy(), 0.4, rtol=1e-5)
