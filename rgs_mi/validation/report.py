@@ -83,9 +83,9 @@ def _html(results, rows, found) -> str:
                             [k for k, row in enumerate(rows) if row["verdict"] != "passes"]))
     if any(r.case.shape == "sphere" and r.error > BOUNDS[r.case.kind] for r in results):
         parts.append(page.paragraph(
-            "Where split_sum is over its bound, what is left is its approximation: three lookups in a filtered environment for "
-            "a lobe that is stretched, and cut off at the horizon, before light with hard edges. Finer levels of the filter "
-            "do not lower it (docs/findings.md). monte_carlo has no such error."))
+            "Where split_sum is over its bound, what is left is its approximation: three lookups in a filtered environment "
+            "for a lobe that is stretched, and cut off at the horizon, before light with hard edges. Finer levels of the "
+            "filter do not lower it (docs/findings.md). monte_carlo has no such error."))
     parts.append(page.heading("Sampler, reciprocity, energy"))
     parts.append(page.table(("check", "value", "bound"), [(c.name, f"{c.value:.4g}", f"{c.bound:g}") for c in found],
                             [k for k, c in enumerate(found) if not c.passed]))
