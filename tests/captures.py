@@ -162,7 +162,7 @@ def write_nero(root, images, depths=None, protocol=4):
         (root / f"{i}-camera.pkl").write_bytes(pickle.dumps([np.linalg.inv(pose)[:3], matrix], protocol))
         save(root / f"{i}.png", pixels)
         if depths is not None:
-            depth = np.broadcast_to(depths, (len(images), *SIZE[::-1]))[i]
+            depth = depths[i] if np.ndim(depths) == 3 else depths
             write_png16(root / f"{i}-depth.png", np.rint(np.clip(depth / 15, 0, 1) * 65535))
     return root
 
