@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from .checkpoint import atomic_file
 from .evaluate import photograph
+from .metrics import normal_colors
 from .pictures import crop, to_8bit
 
 SCORES = ("psnr", "ssim", "lpips", "normal_mae_deg")  # those of `evaluate.SCORES` that tables have room for
@@ -150,7 +151,7 @@ def _rows(view, folders, background):
     normals = [None]
     if view.normal is not None:
         known = np.linalg.norm(view.normal, axis=-1, keepdims=True) > 0.5
-        normals = [np.where(known, view.normal / 2 + 0.5, 1)]
+        normals = [normal_colors(view.normal * known, known[..., 0])]
     normals += [_normals(folder / f"{view.name}_gbuffer.exr") for folder in folders]
     images = [np.asarray(Image.open(folder / f"{view.name}.png"))[..., :3] / 255 for folder in folders]
     for row in ([photograph(view, background), *images], normals):
@@ -164,5 +165,4 @@ def _normals(path):
 
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {name: channel.pixels for name, channel in file.channels().items()}
-    alpha = channels["alpha.Y"][..., None]
-    return (np.stack([channels[f"normal.{axis}"] for axis in "XYZ"], -1) + alpha) / 2 + (1 - alpha)
+    return normal_colors(np.stack([channels[f"normal.{axis}"] for axis in "XYZ"], -1), channels["alpha.Y"])

@@ -27,17 +27,21 @@ def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> 
     ``normal`` [H, W, 3] of any length, ``truth`` [H, W, 3] unit vectors, ``alpha`` [H, W] in [0, 1]. Pixels whose truth
     is zero are unknown and left out; a zero or non-finite ``normal`` counts as 90 degrees. NaN where nothing is known.
     """
-    normal, truth = np.asarray(normal, np.float64), np.asarray(truth, np.float64)
     weight = np.where(np.linalg.norm(truth, axis=-1) > 0.5, alpha, 0).astype(np.float64)
     if weight.sum() == 0:
         return float("nan")
+    return float((weight * normal_angles_deg(normal, truth)).sum() / weight.sum())
+
+
+def normal_angles_deg(normal: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """[H, W] degrees between vectors [H, W, 3] of any length; 90 where one is zero, or ``normal`` is not finite."""
+    normal, truth = np.asarray(normal, np.float64), np.asarray(truth, np.float64)
     normal = np.where(np.isfinite(normal).all(-1, keepdims=True), normal, 0)
-    # Half-angle form: exact for small angles, where arccos of a rounded product is not. A zero vector gives 90 degrees.
+    # Half-angle form: exact for small angles, where arccos of a rounded product is not.
     a = normal * np.linalg.norm(truth, axis=-1, keepdims=True)
     b = truth * np.linalg.norm(normal, axis=-1, keepdims=True)
     angle = 2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
-    angle = np.where(np.linalg.norm(normal, axis=-1) > 0, angle, np.pi / 2)
-    return float(np.degrees((weight * angle).sum() / weight.sum()))
+    return np.degrees(np.where(a.any(-1) & b.any(-1), angle, np.pi / 2))
 
 
 def normal_colors(normal: np.ndarray, alpha: np.ndarray) -> np.ndarray:

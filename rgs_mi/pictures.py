@@ -3,6 +3,7 @@
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from . import metrics
 from .checkpoint import atomic_file
 from .color import srgb_encode
 from .evaluate import Rendering, photograph
@@ -59,11 +60,12 @@ def panels(view, rendering: Rendering, background) -> dict[str, np.ndarray]:
     light = lambda name: over_white(srgb_encode(np.clip(mean(name), 0, 1)) * alpha)
     images = {"photograph": truth, "rendering": rendering.image,
               "error": ramp(np.abs(rendering.image - truth).mean(-1) / ERROR_RANGE),
-              "normals": over_white((maps["normal"] + alpha) / 2)}
+              "normals": metrics.normal_colors(maps["normal"], alpha[..., 0])}
     if view.normal is not None:
         known = np.linalg.norm(view.normal, axis=-1, keepdims=True) > 0.5
-        images["true normals"] = np.where(known, view.normal / 2 + 0.5, 1)
-        images["normal error"] = np.where(known, ramp(_angles(maps["normal"], view.normal) / NORMAL_RANGE), 1)
+        images["true normals"] = metrics.normal_colors(view.normal * known, known[..., 0])
+        angles = metrics.normal_angles_deg(maps["normal"], view.normal)
+        images["normal error"] = np.where(known, ramp(angles / NORMAL_RANGE), 1)
     images |= {"depth": over_white(alpha * _nearness(mean("depth"), alpha > 0.5)).repeat(3, -1),
                "roughness": over_white(maps["roughness"]).repeat(3, -1),
                "metallic": over_white(maps["metallic"]).repeat(3, -1), "base color": light("base_color"),
@@ -74,13 +76,6 @@ def panels(view, rendering: Rendering, background) -> dict[str, np.ndarray]:
 def ramp(values: np.ndarray) -> np.ndarray:
     """Values in [0, 1], any shape, as colours of `RAMP` [..., 3]; what is beyond has the last one."""
     return np.stack([np.interp(values, np.linspace(0, 1, len(RAMP)), channel) for channel in RAMP.T], -1)
-
-
-def _angles(a, b):
-    """[H, W] degrees between vectors [H, W, 3] of any length; 90 where one is zero."""
-    length = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
-    cosine = np.where(length > 0, (a * b).sum(-1) / np.where(length > 0, length, 1), 0)
-    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
 
 
 def _nearness(depth, covered):
