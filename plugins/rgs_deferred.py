@@ -24,7 +24,8 @@ what a principled BSDF with the G-buffer's material reflects of the environment 
  * - indirect
    - |string|
    - What a reflected ray that meets a surfel brings: ``none``, the environment behind it; ``visibility``, nothing;
-     ``one_bounce``, the surfel's own radiance, which in turn reflects the environment alone (Default: ``none``)
+     ``one_bounce``, the surfel's own radiance, which in turn reflects the environment alone. Where the diffuse radiance is
+     ``lit``, the same holds for its light (Default: ``none``)
 
  * - box
    - |string|
@@ -73,7 +74,6 @@ from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.monte_carlo import SAMPLES, MonteCarlo
 from rgs_mi.shading.shader import Shader
 from rgs_mi.shading.split_sum import SplitSum
-from rgs_mi.splat.gbuffer import render_gbuffer
 
 from .surfels import box_of, resolve, surfels_in
 
@@ -144,9 +144,8 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         camera = camera.resized(width * samples, height * samples)
         surfels, eta = surfels_in(scene)
         environment = self.environment(scene)
-        gbuffer = render_gbuffer(surfels, camera)
-        maps = gbuffer.all
-        image = deferred.shade(gbuffer, camera, self.lighting(scene, surfels, eta, environment, seed))
+        image = deferred.render(surfels, camera, self.lighting(scene, surfels, eta, environment, seed))
+        maps = image.gbuffer.all
         rays = deferred.pixel_directions(camera, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]))
         color, alpha = image.color, maps.alpha
         if not self.hide_emitters and environment is not None:
@@ -167,7 +166,9 @@ class DeferredIntegrator(mi.SamplingIntegrator):
             estimator = SplitSum(environment, eta)
         else:
             estimator = MonteCarlo(environment, scene.environment(), eta, self.samples, dr.opaque(mi.UInt32, seed))
-        return deferred.Lighting(estimator, self.shader, each_other, self.diffuse == "lit", self.box)
+        lit = self.diffuse == "lit"
+        lighting = deferred.Lighting(estimator, self.shader, each_other, lit, self.box)
+        return lighting.with_share() if lit and each_other and self.specular == "split_sum" else lighting
 
     def environment(self, scene):
         """The scene's environment, filtered as the estimator needs it; kept until texels change."""

@@ -46,7 +46,8 @@ class Fit:
         self.step_number, self.views_used, self.elapsed = 0, 0, 0.0
         self.gradients = Gradients(len(model))
         self.photographs = None
-        self.proxies = self.emitter = None  # what reflected rays meet; what samples the light
+        # What reflected rays meet; the surfels' share of diffuse light; what samples the light
+        self.proxies = self.share = self.emitter = None
         self._reflective = {}  # (camera, boxes) of what was reflective when a view was last seen
         self.psnr, self.failures = 0.0, 0
         self.curves = Curves()
@@ -109,6 +110,11 @@ class Fit:
         return self._reflects and s.indirect != "none" and self.progress >= s.indirect_start
 
     @property
+    def _shades_itself(self):
+        """Whether surfels know by now how much of the light comes to them; where light is sampled there is no need."""
+        return self._sees_itself and self._lit and not self._samples_light
+
+    @property
     def begun(self) -> tuple[Shading, str]:
         """How the model is shaded by now: the `Shading` and ``indirect`` of a scene that renders the same."""
         specular = "none" if not self._reflects else "monte_carlo" if self._samples_light else "split_sum"
@@ -121,9 +127,10 @@ class Fit:
             return None
         indirect = None
         if self._sees_itself:
-            indirect = Indirect(self.settings.indirect, self.proxies if training else self._proxies(surfels), surfels)
-        return deferred.Lighting(self._estimator(training), self.model.shader(), indirect, self._lit,
-                                 self.shading.box)
+            proxies, share = (self.proxies, self.share) if training else (self._proxies(surfels), None)
+            indirect = Indirect(self.settings.indirect, proxies, surfels, share)
+        lighting = deferred.Lighting(self._estimator(training), self.model.shader(), indirect, self._lit, self.shading.box)
+        return lighting.with_share() if self._shades_itself and not training else lighting
 
     def _estimator(self, training):
         """Of the specular integral, by now."""
@@ -144,6 +151,9 @@ class Fit:
         """Rebuild what is used for many steps."""
         if self.step_number % _REBUILD == 0 or self.proxies is None:
             self.proxies = self._proxies(surfels) if self._sees_itself else None
+            self.share = None
+            if self._shades_itself:
+                self.share = self.lighting(surfels, training=True).with_share(self.step_number).indirect.share
         if self.step_number % _REBUILD == 0 or self.emitter is None:
             self.emitter = self.model.environment().emitter() if self._samples_light else None
 

@@ -7,7 +7,7 @@ import numpy as np
 from .aligned import lanes, tensor
 from .shading.environment import Environment
 from .shading.shader import Shader, initial_weights
-from .surfel import Surfels
+from .surfel import SH_0, Surfels
 
 #: Unconstrained parameters, a row a surfel.
 SURFEL_PARAMETERS = ("centers", "rotations", "log_scales", "logit_opacities", "sh_dc", "sh_rest", "logit_base_color",
@@ -62,7 +62,7 @@ class Model:
             "rotations": rotation_from_normal(normals, rng.uniform(0, 2 * np.pi, n)),
             "log_scales": np.log(scale * np.repeat(spacing[:, None], 2, 1)),
             "logit_opacities": np.full((n, 1), logit(opacity)),
-            "sh_dc": (0.5 * colors - 0.5) / 0.28209479,
+            "sh_dc": (0.5 * colors - 0.5) / SH_0,
             "sh_rest": np.zeros((n, 3 * ((sh_order + 1) ** 2 - 1))),
             "logit_base_color": np.full((n, 3), logit(0.5)),
             "logit_roughness": np.full((n, 1), logit(roughness)),

@@ -4,8 +4,8 @@ lights. What `scripts/recovery.py` calls.
     OUT/recovery.json       the figures below
     OUT/relit_NAME.png      a few views under each light: the truth, the fit, three times their difference
 
-    environment_log_rmse    of log radiance, up to a factor a channel, along the directions that test views reflect and as
-                            blurred as their roughness sees it
+    environment_log_rmse    of log radiance, up to a factor a channel, along the directions that test views reflect, where
+                            nothing of the object lies in between, and as blurred as their roughness sees it
     roughness_mae, metallic_mae, base_color_mae    means over the pixels that the object fills; the base colour up to a
                             factor a channel, which light can take over
     relit                   name -> mean psnr and ssim of the fit under that light, as it is
@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 
 from . import metrics
+from .aligned import lanes
 from .checkpoint import atomic_file
 from .evaluate import photograph
 from .export import SCENE
@@ -35,6 +36,7 @@ from .views import load_dataset
 RECOVERY = "recovery.json"
 _VIEWS = 12  # of the truth under each light
 _WHITE = 1.0
+_ABOVE = 1e-3  # of the diagonal of the object's box
 
 
 def recovery(run, truth, lights=(), *, size=400, out=None, quiet=False) -> dict:
@@ -125,14 +127,25 @@ def _environment(scene, true_scene, views):
     for view in views:
         maps = true_maps(view)
         inside = maps["Alpha"][..., 0] > 0.99
-        rays = view.camera.rays()[inside]
+        rays, normal = view.camera.rays()[inside], maps["Normal"][inside]
+        point = view.camera.origin + rays * maps["Depth"][inside]
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        normal = maps["Normal"][inside]
         reflected = rays - 2 * (rays * normal).sum(1, keepdims=True) * normal
-        direction = mi.Vector3f(np.ascontiguousarray(reflected.T.astype(np.float32)))
-        roughness = mi.Float(np.ascontiguousarray(maps["Roughness"][inside, 0]))
+        clear = ~hidden(true_scene, point, normal, reflected)
+        direction, roughness = _vectors(reflected[clear]), lanes(maps["Roughness"][inside, 0][clear])
         with dr.suspend_grad():
             log = lambda environment: np.log(np.maximum(environment.eval(direction, roughness).numpy(), 1e-4))
             differences.append(log(ours) - log(true))
     difference = np.concatenate(differences, 1)
     return float(np.sqrt(((difference - difference.mean(1, keepdims=True)) ** 2).mean()))
+
+
+def _vectors(v):
+    return mi.Vector3f(*map(lanes, v.T))
+
+
+def hidden(scene, point, normal, direction):
+    """[N] whether something of the ``scene`` is in the way from ``point`` along ``direction`` (all [N, 3]). Points are means
+    over pixels, some beneath the surface, so rays start a little above it."""
+    above = point + normal * (_ABOVE * float(dr.norm(scene.bbox().extents())))
+    return scene.ray_test(mi.Ray3f(mi.Point3f(_vectors(above)), _vectors(direction))).numpy()

@@ -13,6 +13,7 @@ import numpy as np
 #: Channels of each field; `sh` has 3 (L+1)^2 of them, coefficient-major: sh[:, 3 k + c] is coefficient k of colour c.
 CHANNELS = {"centers": 3, "rotations": 4, "scales": 2, "opacities": 1, "sh": None, "base_color": 3, "roughness": 1,
             "metallic": 1, "delta_normal": 3}
+SH_0 = 0.28209479  # the spherical harmonic of order 0
 
 
 @dataclass

@@ -189,12 +189,13 @@ def test_distortion_draws_surfels_together(dataset):
     assert spread[1000.0] < 0.7 * spread[0.0]
 
 
-@pytest.mark.parametrize("indirect", ["none", "one_bounce"])
-def test_no_kernel_is_compiled_after_warm_up(dataset, indirect, monkeypatch):
+@pytest.mark.parametrize("indirect, diffuse", [("none", "radiance"), ("one_bounce", "radiance"), ("one_bounce", "lit")])
+def test_no_kernel_is_compiled_after_warm_up(dataset, indirect, diffuse, monkeypatch):
     """Also with another number of surfels: density control changes it all the time."""
     hits, radiance = [], Indirect._radiance
     monkeypatch.setattr(Indirect, "_radiance", lambda *args: (hits.append(dr.width(args[1])), radiance(*args))[1])
-    fit = Fit(dataset, model(), replace(SETTINGS, iterations=1000, indirect=indirect, indirect_start=0.0), 1.0)
+    settings = replace(SETTINGS, iterations=1000, indirect=indirect, indirect_start=0.0)
+    fit = Fit(dataset, model(), settings, 1.0, Shading(diffuse=diffuse))
     centers = fit.model.numpy("centers")
     fit.model.set("centers", centers + np.where(np.arange(len(centers)) % 2, 0, 1.3)[:, None])  # two balls, side by side
     for n in (290, 270):
@@ -211,6 +212,7 @@ def test_no_kernel_is_compiled_after_warm_up(dataset, indirect, monkeypatch):
             fit.step()
         history = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
     assert len(history) > 100 and (len(set(hits)) > 5) == (indirect != "none")
+    assert (fit.share is not None) == (diffuse == "lit")
     assert [k["hash"] for k in history if not k["cache_hit"] or k["cache_disk"]] == []  # nor read from earlier sessions
 
 

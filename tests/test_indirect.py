@@ -14,14 +14,14 @@ from rgs_mi.proxies import Proxies
 from rgs_mi.shading import deferred
 from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.indirect import Indirect
-from rgs_mi.shading.split_sum import SplitSum
-from rgs_mi.surfel import CHANNELS, Surfels, rotation_from_normal
+from rgs_mi.shading.monte_carlo import MonteCarlo
+from rgs_mi.shading.split_sum import DEFAULT_ETA, SplitSum
+from rgs_mi.surfel import CHANNELS, SH_0, Surfels, rotation_from_normal
 
 from scenes import sphere_surfels
 
 SIZE = (96, 96)
 CAMERA = Camera.look_at([0, -3, 1.2], [0, 0, 0.3], [0, 0, 1], 40, SIZE)
-SH_0 = 0.28209479
 LIGHT = 0.4  # of the environment
 WALL = np.array([0.9, 0.3, 0.1])  # radiance
 
@@ -161,3 +161,50 @@ def test_gradients_equal_finite_differences():
         expected = (4 * central(1e-3) - central(2e-3)) / 3
         rel = 1e-2 if name == "roughness" else 1e-3  # kinks between entries of the tables
         assert (gradient * direction).sum() == pytest.approx(expected, rel=rel), name
+
+
+def lit(surfels, kind, sampled=False):
+    """The `Lighting` of ``surfels`` that a constant light lights diffusely, too; ``kind``: of `Indirect`, None: without."""
+    environment = Environment(mi.TensorXf(np.full((16, 32, 3), LIGHT, np.float32)), np.eye(3))
+    estimator = SplitSum(environment.filtered()) if not sampled else MonteCarlo(
+        environment.unfiltered(), environment.emitter(), DEFAULT_ETA, 256, mi.UInt32(0))
+    return deferred.Lighting(estimator, indirect=kind and Indirect(kind, Proxies(surfels), surfels), lit=True)
+
+
+def disc_over_a_patch(height=0.5, radius=0.4):
+    """One surfel that looks up to a disc of many."""
+    rng = np.random.default_rng(0)
+    r, phi = radius * np.sqrt(rng.random(4000)), rng.uniform(0, 2 * np.pi, 4000)
+    centers = np.concatenate([[[0, 0, 0]], np.stack([r * np.cos(phi), r * np.sin(phi), np.full(4000, height)], 1)])
+    n = len(centers)
+    normals = np.tile([0.0, 0.0, -1.0], (n, 1))
+    normals[0] = 0, 0, 1
+    full = lambda value, channels: np.full((n, channels), value, np.float32)
+    return Surfels.from_numpy({
+        "centers": centers, "rotations": rotation_from_normal(normals), "scales": full(0.01, 2), "opacities": full(0.99, 1),
+        "sh": full(0, 3), "base_color": full(0.5, 3), "roughness": full(0.5, 1), "metallic": full(0, 1),
+        "delta_normal": full(0, 3)}, two_sided=False)
+
+
+@pytest.mark.parametrize("two_sided", [True, False])
+def test_share_of_diffuse_light_under_a_disc(two_sided):
+    """(9) under a constant light: a disc hides r²/(r² + h²) of a hemisphere's cosine."""
+    surfels = replace(disc_over_a_patch(), two_sided=two_sided)
+    lighting = lit(surfels, "visibility")
+    share = np.mean([lighting.with_share(seed).indirect.share.numpy()[:, 0] for seed in range(40)], 0)
+    radius, height = 0.4 + 0.02, 0.5 - 0.02  # quads reach nearly two standard deviations; rays start as far above
+    below = share[0] == 1  # where a surfel that shows from behind is hidden by nothing
+    assert below if two_sided else share[0] == pytest.approx(1 - radius**2 / (radius**2 + height**2), abs=0.01)
+
+
+@pytest.mark.parametrize("kind", ["visibility", "one_bounce"])
+def test_diffuse_light_of_split_sum_is_that_of_monte_carlo(kind):
+    """On the floor before the wall, both matte and lit: without shares half of the light would be too much in the edge."""
+    base = corner().numpy()
+    surfels = Surfels.from_numpy(base | {"metallic": np.zeros_like(base["metallic"]), "roughness": np.ones_like(
+        base["roughness"]), "base_color": np.full_like(base["base_color"], 0.2)}, two_sided=False)
+    lightings = lit(surfels, kind, sampled=True), lit(surfels, None), lit(surfels, kind).with_share()
+    expected, free, shared = (array(deferred.render(surfels, CAMERA, l).diffuse)[..., 0] for l in lightings)
+    floor = floor_reflecting(truth(), WALL)
+    error = lambda image: abs(image - expected)[floor].mean() / expected[floor].mean()
+    assert error(free) > 0.1 and error(shared) < 0.03

@@ -10,12 +10,11 @@ from rgs_mi import proxies, rays
 from rgs_mi.camera import Camera
 from rgs_mi.errors import UserError
 from rgs_mi.render import sensor_dict
-from rgs_mi.surfel import CHANNELS, Surfels, rotation_from_normal
+from rgs_mi.surfel import CHANNELS, SH_0, Surfels, rotation_from_normal
 from rgs_mi.validation.statistics import Difference, Estimate
 
 from scenes import sphere_surfels
 
-SH_0 = 0.28209479
 BATCHES = 8
 
 

@@ -8,7 +8,7 @@ import pytest
 import rgs_mi
 from rgs_mi.errors import UserError
 from rgs_mi.ply import write_ply
-from rgs_mi.surfel import CHANNELS, Surfels, rotation_from_normal
+from rgs_mi.surfel import CHANNELS, SH_0, Surfels, rotation_from_normal
 
 from scenes import orbit_camera, sphere_surfels
 
@@ -65,7 +65,7 @@ def mirror_sphere(n, scale):
     full = lambda value, channels=1: np.full((n, channels), value)
     return Surfels.from_numpy({
         "centers": x, "rotations": rotation_from_normal(x), "scales": full(scale, 2), "opacities": full(0.95),
-        "sh": full(-0.5 / 0.28209479, 3), "base_color": full(1.0, 3), "roughness": full(0.05), "metallic": full(1.0),
+        "sh": full(-0.5 / SH_0, 3), "base_color": full(1.0, 3), "roughness": full(0.05), "metallic": full(1.0),
         "delta_normal": full(0.0, 3)}, two_sided=False)
 
 

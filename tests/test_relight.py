@@ -13,7 +13,7 @@ from rgs_mi.camera import Camera
 from rgs_mi.errors import UserError
 from rgs_mi.evaluate import photograph
 from rgs_mi.load import load_scene
-from rgs_mi.recovery import recovery, true_maps
+from rgs_mi.recovery import hidden, recovery, true_maps
 from rgs_mi.relight import edit, relight
 from rgs_mi.render import render_scene, sensor_dict, straight
 from rgs_mi.views import load_dataset
@@ -152,3 +152,13 @@ def test_true_maps(inputs):
     assert np.allclose(maps["Roughness"][inside], 0.25, atol=1e-3) and np.allclose(maps["Metallic"][inside], 1, atol=1e-3)
     assert maps["Normal"].shape[-1] == maps["Albedo"].shape[-1] == 3
     assert np.allclose(np.linalg.norm(maps["Normal"][inside], axis=-1), 1, atol=1e-3)
+
+
+def test_hidden():
+    """A ball over a floor hides the sky from what is under it, and not from what is beside it; not from a point that has
+    sunk a little into the floor either."""
+    scene = mi.load_dict({"type": "scene", "floor": {"type": "rectangle"},
+                          "ball": {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.3}})
+    point = np.array([[0, 0, 0], [0.8, 0, 0], [0.8, 0, -1e-4]])
+    up = np.tile([0.0, 0.0, 1.0], (3, 1))
+    assert hidden(scene, point, up, up).tolist() == [True, False, False]

@@ -47,9 +47,9 @@ class Lighting:
         C_s = self.estimator.specular(normal, view, roughness, metallic, base_color, cover)
         return C_s if self.shader is None else self.shader(C_s, roughness, dr.dot(normal, view))
 
-    def diffuse(self, normal, view, roughness, metallic, base_color, point=None):
-        """C_d where it is ``lit``; as `specular`."""
-        return self.estimator.diffuse(normal, view, roughness, metallic, base_color, self._cover(normal, point))
+    def diffuse(self, normal, view, roughness, metallic, base_color, point=None, share=1):
+        """C_d where it is ``lit``; as `specular`. ``share``: of the light, that comes there."""
+        return self.estimator.diffuse(normal, view, roughness, metallic, base_color, self._cover(normal, point), share)
 
     def _cover(self, normal, point):
         """What an estimator asks what comes along a direction; None: the environment's radiance does."""
@@ -58,6 +58,22 @@ class Lighting:
             return self.indirect.cover(light, at(point), at(normal), direction, self)
 
         return None if point is None else cover
+
+    @property
+    def _shares(self):
+        return self.lit and self.indirect is not None and self.indirect.share is not None
+
+    def with_share(self, seed=0) -> "Lighting":
+        """The same, where the object hides some of its own light from itself; see `Indirect.with_share`."""
+        return replace(self, indirect=self.indirect.with_share(self, dr.opaque(mi.UInt32, seed)))
+
+    def splatted(self, surfels):
+        """``surfels`` as they are splatted: what is lit has no radiance of its own, but its share of the light."""
+        return self.indirect.carried(surfels, self.box) if self._shares else surfels
+
+    def share(self, maps, mean):
+        """The same share in pixels of these ``maps``, which ``mean`` divides by their coverage."""
+        return maps.diffuse * mean if self._shares else 1
 
     def seen_again(self) -> "Lighting":
         """The lighting of what a reflected ray meets: it reflects the environment alone."""
@@ -133,10 +149,12 @@ def _reflected(gbuffer, camera, lighting):
         surfaces = normal, -direction, m.roughness * mean, m.metallic * mean, m.base_color * mean, point
         dr.scatter(specular, lighting.specular(*surfaces) * m.alpha, index)
         if lighting.lit:
-            dr.scatter(diffuse, lighting.diffuse(*surfaces) * m.alpha, index)
+            dr.scatter(diffuse, lighting.diffuse(*surfaces, lighting.share(m, mean)) * m.alpha, index)
     return diffuse, specular
 
 
 def render(surfels, camera, lighting: Lighting | None, screen_offset=None, squares=False) -> Image:
     """Splat (see `render_gbuffer`) and `shade`; differentiable in the surfels' fields, the environment and the shader."""
+    if lighting is not None:
+        surfels = lighting.splatted(surfels)
     return shade(render_gbuffer(surfels, camera, screen_offset, squares=squares), camera, lighting)

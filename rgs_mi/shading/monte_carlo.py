@@ -20,11 +20,9 @@ import drjit as dr
 import mitsuba as mi
 
 from .environment import FilteredEnvironment
+from .sequence import points
 
 SAMPLES = 16  # a pixel, unless someone says otherwise
-#: Increments of the two-dimensional golden-ratio sequence (Roberts 2018), in units of 2⁻³²; a random offset a pixel makes
-#: each of its points uniform, and the points of a pixel fill the square evenly.
-_R2 = (3242174889, 2447445414)
 _LANES = 1 << 22  # samples at a time
 _OTHER, _DEEPER, _DIFFUSE = 0x9E3779B9, 0x85EBCA6B, 0xC2B2AE35  # what makes of a seed another
 
@@ -48,8 +46,8 @@ class MonteCarlo:
         """C_s of (7), ``mi.Color3f``; see `SplitSum.specular`."""
         return self._integral(SpecularLobe, normal, view, roughness, metallic, base_color, cover)
 
-    def diffuse(self, normal, view, roughness, metallic, base_color, cover=None):
-        """C_d of (7), ``mi.Color3f``, where ``cover`` counts, too."""
+    def diffuse(self, normal, view, roughness, metallic, base_color, cover=None, share=None):
+        """C_d of (7), ``mi.Color3f``, where ``cover`` counts, too; of a ``share`` there is no need."""
         other = replace(self, seed=self.seed ^ _DIFFUSE)
         return other._integral(DiffuseLobe, normal, view, roughness, metallic, base_color, cover)
 
@@ -83,12 +81,9 @@ class MonteCarlo:
         normal, view, roughness, metallic, base_color = _spread((normal, view, roughness, metallic, base_color), count)
         material = lobe(roughness, metallic, base_color, self.eta)
         si = _interaction(normal, view)
-        rng = mi.PCG32(size=n, initstate=mi.UInt64(self.seed))
-        offsets = [[rng.next_uint32() for _ in _R2] for _ in range(2)]
-        dr.eval(offsets)
-        point = lambda k: mi.Point2f(*(_unit(dr.gather(mi.UInt32, o, pixel) + number * g) for o, g in zip(offsets[k], _R2)))
-        lit = self.emitter.sample_direction(si, point(0))[0].d
-        bounced = si.to_world(material.sample(si, mi.Float(0.5), point(1)))
+        of_light, of_lobe = points(n, self.seed, pixel, number, sets=2)
+        lit = self.emitter.sample_direction(si, of_light)[0].d
+        bounced = si.to_world(material.sample(si, mi.Float(0.5), of_lobe))
         total = mi.Color3f(0)
         for direction in (dr.detach(lit), bounced):
             local = si.to_local(direction)
@@ -215,11 +210,6 @@ class _Spread(dr.CustomOp):
 
     def name(self):
         return "rgs_mi.shading.Spread"
-
-
-def _unit(x):
-    """``mi.UInt32`` as numbers in [0, 1)."""
-    return mi.Float(x >> 8) * 2**-24
 
 
 def _interaction(normal, view):

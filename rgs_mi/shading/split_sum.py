@@ -43,10 +43,11 @@ class SplitSum:
             incoming = cover(incoming, reflected, None)
         return incoming * E
 
-    def diffuse(self, normal, view, roughness, metallic, base_color, cover=None):
-        """The same for the diffuse lobe, of which ``cover`` is not asked: it has no one direction."""
+    def diffuse(self, normal, view, roughness, metallic, base_color, cover=None, share=1):
+        """The same for the diffuse lobe, to which ``share`` of the light comes ((9) of `indirect`); ``cover`` is not asked:
+        that lobe has no one direction."""
         E = _table(dr.dot(normal, view), roughness, (3,), self.eta)[0]
-        return self.environment.eval_diffuse(normal) * E * (1 - metallic) * base_color
+        return self.environment.eval_diffuse(normal) * share * E * (1 - metallic) * base_color
 
     def seen_again(self) -> "SplitSum":
         """The estimator of what a reflected ray meets."""

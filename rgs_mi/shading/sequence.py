@@ -1,0 +1,23 @@
+"""Points that fill the unit square evenly: the golden ratio's sequence in two dimensions (Roberts 2018)."""
+
+import drjit as dr
+import mitsuba as mi
+
+_R2 = (3242174889, 2447445414)  # its increments, in units of 2⁻³²
+
+
+def points(n: int, seed, lane, number, sets: int = 1):
+    """``sets`` independent ``mi.Point2f``: element ``number`` of the sequence, shifted by a random offset that is the same
+    wherever ``lane``, below ``n``, is. Each is uniform then, and those of a lane fill the square evenly.
+
+    ``seed``, ``lane``, ``number``: ``mi.UInt32``.
+    """
+    rng = mi.PCG32(size=n, initstate=mi.UInt64(seed))
+    offsets = [[rng.next_uint32() for _ in _R2] for _ in range(sets)]
+    dr.eval(offsets)
+    return [mi.Point2f(*(_unit(dr.gather(mi.UInt32, o, lane) + number * g) for o, g in zip(pair, _R2))) for pair in offsets]
+
+
+def _unit(x):
+    """``mi.UInt32`` as numbers in [0, 1)."""
+    return mi.Float(x >> 8) * 2**-24
