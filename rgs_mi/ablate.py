@@ -43,11 +43,13 @@ class Variant:
     scenes: int | None = None
 
 
-#: What surfels at random lack: the shape that views agree on, and rates for normals that are nearly right.
-HULL = ("start.hull=true", "rates.rotations=[2e-3,2e-4]")
+#: What surfels at random lack: the shape that masks agree on, and rates for normals that are nearly right.
+HULL = ("start.hull=true", "start.carve=false", "rates.rotations=[2e-3,2e-4]")
+#: The shape that photographs agree on, too.
+STEREO = (*HULL, "start.carve=true")
 #: Cross-view shape consistency regularisation; in the paper's loss it stands in the place of 2DGS's own consistency.
-CSCR = (*HULL, "weights.depth=1e-3", "weights.normal=1e-2", "weights.crease=0", "weights.delta_normal=1e-3",
-        "weights.consistency=[0,0]", "rates.delta_normal=[1e-3,1e-4]", "prior.name=hull")
+CSCR = (*STEREO, "weights.depth=1e-3", "weights.normal=1e-2", "weights.crease=0", "weights.delta_normal=1e-3",
+        "weights.consistency=[0,0]", "rates.delta_normal=[1e-3,1e-4]", "prior.name=stereo")
 #: Reflection-guided densification.
 RD = ("density.guided=true",)
 
@@ -55,6 +57,7 @@ VARIANTS = {
     "sh2dgs": Variant("2DGS, not deferred", "sh2dgs"),
     "baseline": Variant("deferred 2DGS", "deferred2dgs"),
     "hull": Variant("+ start on the hull", "deferred2dgs", HULL),
+    "stereo": Variant("+ start on the carved hull", "deferred2dgs", STEREO),
     "cscr": Variant("+ CSCR", "deferred2dgs", CSCR),
     "rd": Variant("+ RD", "deferred2dgs", RD),
     "full": Variant("full: + CSCR + RD", "deferred2dgs", CSCR + RD),

@@ -75,7 +75,7 @@ def _saved(folder, resume):
 
 def start(scene, dataset, settings) -> Fit:
     """A fit at its beginning."""
-    points = initial_points(dataset, settings.start.surfels, settings.seed, settings.start.hull)
+    points = initial_points(dataset, settings.start.surfels, settings.seed, settings.start.hull, settings.start.carve)
     random = points[1] is None and not (dataset.points is not None and len(dataset.points))
     opacity = settings.start.opacity or (_ANYWHERE if random else _ON_SURFACE)
     shading = _shading(scene, dataset, settings)

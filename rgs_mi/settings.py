@@ -23,6 +23,7 @@ class Start:
 
     surfels: int = _within(25_000, 1, 10_000_000)
     hull: bool = True  # on the visual hull, where photographs have masks; else on the data set's points, or at random
+    carve: bool = True  # that hull less what photographs look through (`priors.stereo`)
     scale: float = _within(0.8, 0.01, 10)  # standard deviation over the distance to the neighbours
     opacity: float | None = _within(None, 0.001, 0.999)  # unless given: 0.1 at random points, else 0.7
     roughness: float = _within(0.3, 0, 1)
@@ -66,7 +67,7 @@ class Weights:
 class Prior:
     """Where the depth prior of the photographs comes from, and the options of its function (`priors`)."""
 
-    name: Literal["hull", "files", "vggt", "none"] = "none"
+    name: Literal["hull", "stereo", "files", "vggt", "none"] = "none"
     options: dict[str, Any] = field(default_factory=dict)
 
 

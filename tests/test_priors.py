@@ -52,15 +52,17 @@ def fails(match, *args, **options):
 # ---- The interface ----
 
 def test_names_and_options():
-    assert NAMES == ("hull", "files", "vggt", "none") and depth_priors("none", [view()]) is None
-    fails("prior 'depth' is unknown: choose one of hull, files, vggt, none", "depth", [])
+    assert NAMES == ("hull", "stereo", "files", "vggt", "none") and depth_priors("none", [view()]) is None
+    fails("prior 'depth' is unknown: choose one of hull, stereo, files, vggt, none", "depth", [])
     fails("prior 'hull'.*'folder'.*options are resolution", "hull", [], folder=".")
     fails("prior 'files'.*missing.*'folder'.*options are folder, inverse, suffix", "files", [])
 
 
-def test_hull():
+@pytest.mark.parametrize("name", ["hull", "stereo"])
+def test_hull(name):
+    """Stereo carves nothing off a ball of one colour."""
     views = ball()
-    priors = depth_priors("hull", views, resolution=48)
+    priors = depth_priors(name, views, resolution=48)
     for prior, v in zip(priors, views):
         assert prior.values.shape == (40, 40) and prior.values.dtype == np.float32 and not prior.inverse
         seen = np.isfinite(prior.values)

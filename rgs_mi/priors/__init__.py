@@ -1,6 +1,7 @@
 """Depth priors: what is known of a photograph's depth before anything is fitted, one interface for all of them.
 
     hull    the visual hull of the masks (`hull.py`): no network, and no reflection misleads it
+    stereo  that hull, less what the photographs look through (`stereo.py`)
     files   maps of any estimator, one a photograph (`files.py`)
     vggt    the foundation model (`vggt.py`), where its package and weights are
     none
@@ -16,7 +17,7 @@ import numpy as np
 
 from ..checkpoint import atomic_file
 from ..errors import UserError
-from . import files, hull, vggt
+from . import files, hull, stereo, vggt
 from .maps import DepthPrior
 
 __all__ = ["NAMES", "DepthPrior", "depth_priors"]
@@ -26,11 +27,20 @@ _VERSION = 1  # of everything that decides what is in the maps: a cached prior o
 
 def _hull(views, resolution: int = 160) -> list[DepthPrior]:
     """z-depths of the visual hull, ``resolution`` steps along its longest side; NaN beside it. Needs a JIT variant."""
-    vertices, faces, _ = hull.surface(hull.visual_hull(views, resolution))
+    return _depths(hull.visual_hull(views, resolution), views)
+
+
+def _stereo(views, resolution: int = 160) -> list[DepthPrior]:
+    """As `_hull`, of `stereo.carved_hull`."""
+    return _depths(stereo.carved_hull(views, resolution), views)
+
+
+def _depths(field, views):
+    vertices, faces, _ = hull.surface(field)
     return [DepthPrior(depth) for depth in hull.depth_maps(vertices, faces, [view.camera for view in views])]
 
 
-_PRIORS = {"hull": _hull, "files": files.load, "vggt": vggt.estimate}
+_PRIORS = {"hull": _hull, "stereo": _stereo, "files": files.load, "vggt": vggt.estimate}
 NAMES = (*_PRIORS, "none")
 
 
@@ -42,8 +52,8 @@ def depth_priors(name: str, views, *, cache=None, **options) -> list[DepthPrior]
       views: list of `View`
       cache: folder where results are kept, or None. A result is found again by the photographs' pixels, the options, the
         hull's cameras and VGGT's weights, wherever the files lie. What `files` reads is not kept a second time
-      options: hull: resolution; files: folder, inverse, suffix (`files.load`); vggt: weights, batch, overlap, background
-        (`vggt.estimate`); none takes any
+      options: hull, stereo: resolution; files: folder, inverse, suffix (`files.load`); vggt: weights, batch, overlap,
+        background (`vggt.estimate`); none takes any
 
     Raises: UserError for a name or an option that is not there, and as the prior itself does.
     """
@@ -78,7 +88,7 @@ def _key(name, views, options) -> str:
     for view in views:
         digest.update(f"{view.pixels.dtype} {view.pixels.shape} {view.masked}".encode())
         digest.update(np.ascontiguousarray(view.pixels))
-        if name == "hull":
+        if name in ("hull", "stereo"):
             camera = view.camera
             digest.update(np.concatenate([camera.to_world.ravel(), camera.focal, camera.principal, camera.size]).tobytes())
     return digest.hexdigest()

@@ -1,0 +1,216 @@
+"""What lies below the visual hull, seen by the photographs: a plane sweep, with the hull's own shape as the plane.
+
+    1. `sweep`   Each view asks, pixel by pixel, how deep below the hull its surroundings look alike in the views next to it:
+                 normalised cross-correlation over a window, the mean of the best few (Collins 1996, Goesele et al. 2006).
+    2. `_agreed` A mirror image is alike somewhere below the hull, too, but elsewhere for other views. A point counts where
+                 most of the views that find something in its direction find it there.
+    3. `carve`   Grid nodes that several views look through are carved off the hull's field.
+
+So a cup gets its inside, and a ball of chrome stays one. Nothing here needs a network.
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy import ndimage
+
+from ..aligned import lanes
+from . import hull
+
+_WIDTH = 200  # pixels of a photograph's copy at most
+_LEVELS = 40  # depths below the hull
+_REACH = 0.75  # the deepest, over the hull's radius
+_NEIGHBOURS, _BEST = 6, 3  # views that each is compared with, and those of them that count
+_WINDOW = 2  # pixels on each side
+_ALIKE, _GAIN = 0.75, 0.15  # correlation that is enough, and how much above the hull's own it must be
+_ABOVE = 2  # levels that count as the hull itself
+_SAME = 1.5  # levels between two views' depths that are the same
+_AGREED, _VIEWS = 0.4, 3  # part and number of views that must find the same
+_SEEN_THROUGH = 3  # views that look through what is carved
+_FLAT = 1e-4  # variance of grey levels in a window that shows nothing
+
+
+def carved_hull(views, resolution: int = 160):
+    """`hull.visual_hull` of ``views``, less what they look through: a `hull.SignedField`. Needs a JIT variant."""
+    field = hull.visual_hull(views, resolution)
+    vertices, faces, _ = hull.surface(field)
+    small = [Small.of(view) for view in views]
+    depths = hull.depth_maps(vertices, faces, [s.camera for s in small])
+    radius = float(np.linalg.norm(vertices - vertices.mean(0), axis=1).max())
+    step = _REACH * radius / _LEVELS
+    deeper = [sweep(i, small, depths, step) for i in range(len(small))]
+    return carve(field, small, depths, _agreed(small, depths, deeper, step), step)
+
+
+class Small:
+    """A photograph's small copy: its ``camera``, and ``grey`` display values [H, W] over white."""
+
+    def __init__(self, camera, grey):
+        self.camera, self.grey = camera, grey
+
+    @classmethod
+    def of(cls, view):
+        width, height = view.camera.size
+        factor = max(1, -(-width // _WIDTH))
+        pixels = view.pixels / np.float32(255) if view.pixels.dtype == np.uint8 else view.pixels
+        grey = np.clip(pixels[..., :3], 0, 1).mean(-1) * pixels[..., 3] + 1 - pixels[..., 3]
+        w, h = width // factor, height // factor
+        grey = grey[:h * factor, :w * factor].reshape(h, factor, w, factor).mean((1, 3))
+        camera = view.camera.cropped(0, 0, w * factor, h * factor).resized(w, h)
+        return cls(camera, np.ascontiguousarray(grey, np.float32))
+
+    def cropped(self, window):
+        """The same within ``window``, slices of rows and columns."""
+        rows, columns = window
+        camera = self.camera.cropped(columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start)
+        return Small(camera, np.ascontiguousarray(self.grey[window]))
+
+
+# ---- How alike ----
+
+def sweep(i, small, depths, step):
+    """[H, W] how much deeper than the hull the surface of view ``i`` lies, world units along the viewing axis; 0 where it is
+    the hull, or nothing can be told. ``depths``: of the hull; ``step``: between two levels."""
+    deeper, known = np.zeros_like(depths[i]), np.isfinite(depths[i])
+    if not known.any():
+        return deeper
+    (window,) = ndimage.find_objects(known.astype(np.int8))
+    here, depth, known = small[i].cropped(window), depths[i][window], known[window]
+    level = (np.arange(_LEVELS) - _ABOVE / 2) * step
+    mean = alikeness(here, depth, level, [(small[j], depths[j]) for j in _next_to(i, small)], 2 * step)
+    mean[:, ~ndimage.binary_erosion(known, iterations=_WINDOW)] = -1
+    found, top = mean.argmax(0), mean.max(0)
+    sure = (found > _ABOVE) & (found < _LEVELS - 2) & (top > _ALIKE) & (top - mean[:_ABOVE + 1].max(0) > _GAIN)
+    deeper[window] = np.where(sure, level[found], 0)
+    return deeper
+
+
+def _next_to(i, small):
+    """Numbers of the views that look most nearly the same way as view ``i``."""
+    forward = np.array([s.camera.rotation[2] for s in small])
+    alike = forward @ forward[i]
+    alike[i] = -np.inf
+    return np.argsort(-alike)[:min(_NEIGHBOURS, len(small) - 1)]
+
+
+def alikeness(here, depth, level, others, margin):
+    """How much the surroundings of each pixel of ``here`` look like what ``others``, pairs of a `Small` and its hull's
+    depth, show if it lies at ``depth`` + ``level`` [L]: [L, H, W], the mean of the best few correlations, at least −1.
+    That with a view whose frame the point is not in, or whose hull it is more than ``margin`` above, is −1."""
+    best = [mi.Float(-1)] * _BEST
+    points = _points(here.camera, depth, level)
+    for other, surface in others:
+        score = _correlation(here.grey, *_warp(points, other, surface, margin))
+        for k in range(_BEST):  # keep the largest, in order
+            best[k], score = dr.maximum(best[k], score), dr.minimum(best[k], score)
+        dr.eval(best)
+    return (sum(best) / _BEST).numpy().reshape(len(level), *depth.shape)
+
+
+def _points(camera, depth, level):
+    """World points below the hull, a lane a level and pixel."""
+    filled = np.where(np.isfinite(depth), depth, np.nanmax(depth))
+    lane, n = dr.arange(mi.UInt32, filled.size * len(level)), dr.opaque(mi.UInt32, filled.size)
+    number = lambda x: dr.opaque(mi.Float, float(x))  # or each camera would be compiled into kernels of its own
+    pixel = lane % n
+    z = dr.gather(mi.Float, lanes(filled), pixel) + dr.gather(mi.Float, lanes(level), lane // n)
+    x, y, back = (dr.gather(mi.Float, lanes(camera.rays()[..., k]), pixel) * z + number(camera.origin[k]) for k in range(3))
+    point = mi.Point3f(x, y, back)
+    dr.eval(point)
+    return point
+
+
+def _warp(points, other, depth, margin):
+    """(grey levels of the ``other`` photograph at ``points``, whether these can be its surface: in its frame, not above its
+    hull)."""
+    camera, number = other.camera, lambda x: dr.opaque(mi.Float, float(x))
+    width, height = camera.size
+    local = [sum(number(r) * (p - number(o)) for r, p, o in zip(row, points, camera.origin)) for row in camera.rotation]
+    x = local[0] / local[2] * number(camera.focal[0]) + number(camera.principal[0] - 0.5)
+    y = local[1] / local[2] * number(camera.focal[1]) + number(camera.principal[1] - 0.5)
+    inside = (local[2] > 0) & (x >= 0) & (y >= 0) & (x < number(width - 1)) & (y < number(height - 1))
+    column, row = dr.floor(x), dr.floor(y)
+    at = mi.UInt32(dr.select(inside, row * number(width) + column, 0))
+    grey, right, below = lanes(other.grey), dr.opaque(mi.UInt32, 1), dr.opaque(mi.UInt32, width)
+    fetch = lambda k: dr.gather(mi.Float, grey, at + k, inside)
+    fx, fy = x - column, y - row
+    value = dr.lerp(dr.lerp(fetch(0), fetch(right), fx), dr.lerp(fetch(below), fetch(below + right), fx), fy)
+    surface = dr.gather(mi.Float, lanes(np.where(np.isfinite(depth), depth, np.inf)), at, inside)
+    inside &= local[2] > surface - number(margin)
+    value = dr.select(inside, value, 1)
+    dr.eval(value, inside)
+    return value, inside
+
+
+def _correlation(grey, warped, inside):
+    """Normalised cross-correlation of the windows around each pixel of ``grey`` and of its ``warped`` neighbour."""
+    height, width = grey.shape
+    pixel = dr.arange(mi.UInt32, dr.width(warped)) % dr.opaque(mi.UInt32, grey.size)
+    at = lambda image: dr.gather(mi.Float, lanes(image), pixel)
+    mean, square = (at(ndimage.uniform_filter(grey.astype(np.float64)**k, 2 * _WINDOW + 1, mode="nearest"))
+                    for k in (1, 2))
+    m, mm, cross = _means([warped, warped * warped, warped * at(grey)], width, height)
+    spread = dr.sqrt(dr.maximum(square - mean * mean, _FLAT) * dr.maximum(mm - m * m, _FLAT))
+    score = dr.select(inside, (cross - m * mean) / spread, -1)
+    dr.eval(score)
+    return score
+
+
+def _means(images, width, height):
+    """Means over windows of stacks of images, which end at each image's borders."""
+    lane = dr.arange(mi.UInt32, dr.width(images[0]))
+    columns, rows = dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, height)
+    for position, extent, stride in ((lane % columns, columns, 1), (lane // columns % rows, rows, columns)):
+        dr.eval(images)
+        sums = [mi.Float(0)] * len(images)
+        for offset in range(-_WINDOW, _WINDOW + 1):
+            moved = mi.Int32(position) + offset
+            moved = dr.clip(moved, 0, mi.Int32(extent) - 1) - mi.Int32(position)
+            at = mi.UInt32(mi.Int32(lane) + moved * mi.Int32(stride))
+            sums = [s + dr.gather(mi.Float, image, at) for s, image in zip(sums, images)]
+        images = [s / (2 * _WINDOW + 1) for s in sums]
+    return images
+
+
+# ---- What views agree on ----
+
+def _agreed(small, depths, deeper, step):
+    """``deeper``, 0 where its points are not what the other views that look for them there have found, most of the time."""
+    sure = [below > 0 for below in deeper]
+    points = np.concatenate([s.camera.origin + s.camera.rays()[where] * (depth + below)[where][:, None]
+                             for s, depth, below, where in zip(small, depths, deeper, sure)])
+    found, agree = np.zeros((2, len(points)), np.int64)
+    for s, depth, below in zip(small, depths, deeper):
+        z, (at, below_at) = _look(s.camera, points, depth, below)
+        found += below_at > 0
+        agree += (below_at > 0) & (abs(z - at - below_at) < _SAME * step)
+    kept = (agree > _VIEWS) & (agree > _AGREED * found)  # its own view is one of them
+    for below, where, part in zip(deeper, sure, np.split(kept, np.cumsum([w.sum() for w in sure])[:-1])):
+        below[where] *= part
+    return deeper
+
+
+def _look(camera, points, *maps):
+    """(z-depths of ``points``, the entries of ``maps`` where they are seen, NaN beyond the frame)."""
+    pixel, z = camera.project(points)
+    column, row = np.floor(pixel).astype(np.int64).T
+    inside = (z > 0) & (column >= 0) & (row >= 0) & (column < camera.size[0]) & (row < camera.size[1])
+    values = [np.full(len(points), np.nan, np.float32) for _ in maps]
+    for value, image in zip(values, maps):
+        value[inside] = image[row[inside], column[inside]]
+    return z, values
+
+
+def carve(field, small, depths, deeper, step):
+    """``field`` less the nodes through which several views look at something deeper."""
+    inside = np.argwhere(field.values > 0)
+    points = field.lower + field.step * inside
+    through = np.zeros(len(points), np.int64)
+    for s, depth, below in zip(small, depths, deeper):
+        z, (at, below_at) = _look(s.camera, points, depth, below)
+        through += (below_at > 0) & (z < at + below_at - step)
+    gone = np.zeros(field.values.shape, bool)
+    gone[tuple(inside[through >= _SEEN_THROUGH].T)] = True
+    values = ndimage.gaussian_filter(np.where(gone, -field.step, field.values), 1.0)
+    values = np.where(ndimage.binary_dilation(gone, iterations=2), np.minimum(values, field.values), field.values)
+    return hull.SignedField(values, field.lower, field.step)
