@@ -277,7 +277,8 @@ class Fit:
         if d.start <= self.progress < d.stop:
             # The budget opens gradually: what is spent early goes where the coarse images, not the fine ones, need it.
             opened = (self.progress - d.start) / (d.stop - d.start)
-            budget = int(self.settings.start.surfels + opened * (d.max_surfels - self.settings.start.surfels))
+            first, last = self.settings.start.surfels, self.settings.max_surfels
+            budget = int(first + opened * (last - first))
             rng = np.random.default_rng((self.settings.seed, self.step_number))
             densify(self.model, self.gradients, self._reach(), d, rng, budget, self._guided())
             self.proxies = None

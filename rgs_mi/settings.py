@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+_SURFELS, _SURFELS_A_MINUTE = 50_000, 5_000
+
 
 def _within(default, low, high):
     return field(default=default, metadata={"min": low, "max": high})
@@ -81,7 +83,7 @@ class Density:
     threshold: float = _within(2e-4, 0, 1)  # positional gradient in NDC units
     dense: float = _within(0.01, 0, 1)  # surfels smaller than this (in units of the object) are cloned, others split
     prune_opacity: float = _within(0.05, 0, 1)
-    max_surfels: int = _within(50_000, 1, 10_000_000)
+    max_surfels: int | None = _within(None, 1, 10_000_000)  # unless given: see `Settings.max_surfels`
     guided: bool = False  # half the threshold where two views or more see something reflective (RGS, Algorithm 1)
 
 
@@ -114,3 +116,8 @@ class Settings:
     weights: Weights = Weights()
     prior: Prior = Prior()
     density: Density = Density()
+
+    @property
+    def max_surfels(self) -> int:
+        """How many surfels a fit may have: unless it is given, as many as it has time for."""
+        return self.density.max_surfels or max(_SURFELS, int(_SURFELS_A_MINUTE * (self.minutes or 0)))

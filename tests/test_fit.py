@@ -265,3 +265,9 @@ def test_opacities_to_start_with(dataset, where, opacity):
     np.testing.assert_allclose(surfels.opacities.numpy(), opacity, rtol=1e-5)
     settings = replace(settings, start=replace(settings.start, opacity=0.4))
     np.testing.assert_allclose(start(scene, data, settings).model.surfels(0).opacities.numpy(), 0.4, rtol=1e-5)
+
+
+@pytest.mark.parametrize("changes, surfels", [({"minutes": 8.0}, 50_000), ({"minutes": 30.0}, 150_000), (
+    {"minutes": None, "iterations": 10**6}, 50_000), ({"minutes": 30.0, "density": Density(max_surfels=7)}, 7)])
+def test_surfels_for_the_time(changes, surfels):
+    assert replace(Settings(), **changes).max_surfels == surfels
