@@ -11,19 +11,20 @@ _FAR = 10
 _SRGB_TO_LINEAR = srgb_decode(np.arange(256) / 255).astype(np.float32)
 
 
-def initial_points(dataset: Dataset, count: int, seed: int = 0, on_hull: bool = True, carve: bool = True):
+def initial_points(dataset: Dataset, count: int, seed: int = 0, on_hull: bool = True, carve: bool = True,
+                   quiet: bool = True):
     """Starting points of a fit to ``dataset.train``, world space, all float32.
 
     The surface of the visual hull (of `stereo.carved_hull` with ``carve``) where photographs have masks and ``on_hull`` is
     set (``count`` points), else ``dataset.points`` (a random ``count`` of them where there are more), else ``count`` points
-    at random in the ball that the cameras look into.
+    at random in the ball that the cameras look into. ``quiet``: no progress.
 
     Returns: positions [N, 3]; unit normals [N, 3], or None without a hull; linear colours [N, 3], the mean of the
     photographs that see the point; spacing [N], the mean distance to the three nearest neighbours (at least 1e-7).
     """
     rng, views = np.random.default_rng(seed), dataset.train
     if on_hull and any(view.masked for view in views):
-        mesh = hull.surface(stereo.carved_hull(views) if carve else hull.visual_hull(views))
+        mesh = hull.surface(stereo.carved_hull(views, quiet=quiet) if carve else hull.visual_hull(views))
         positions, normals = hull.sample_surface(*mesh, count, rng)
         spacing = _spacing(positions)
         depths = hull.depth_maps(*mesh[:2], [view.camera for view in views])

@@ -49,7 +49,7 @@ def optimize(path, *, data=None, variables=None, config=None, overrides=(), minu
     saved = _saved(folder, resume)
     events = Events(folder / "tensorboard", saved[1]["step"] if saved else 0) if tensorboard else None
     dataset = scene.dataset(quiet)
-    fit = _resume(saved, scene, dataset, settings) if saved else start(scene, dataset, settings)
+    fit = _resume(saved, scene, dataset, settings) if saved else start(scene, dataset, settings, quiet)
     stopped = _loop(fit, folder, quiet, events)
     results.write(fit, scene, folder, quiet)
     if stopped:
@@ -73,11 +73,12 @@ def _saved(folder, resume):
     return None
 
 
-def start(scene, dataset, settings) -> Fit:
+def start(scene, dataset, settings, quiet=True) -> Fit:
     """A fit at its beginning."""
-    points = initial_points(dataset, settings.start.surfels, settings.seed, settings.start.hull, settings.start.carve)
+    begin = settings.start
+    points = initial_points(dataset, begin.surfels, settings.seed, begin.hull, begin.carve, quiet)
     random = points[1] is None and not (dataset.points is not None and len(dataset.points))
-    opacity = settings.start.opacity or (_ANYWHERE if random else _ON_SURFACE)
+    opacity = begin.opacity or (_ANYWHERE if random else _ON_SURFACE)
     shading = _shading(scene, dataset, settings)
     if shading.box is None:
         extent = float(np.linalg.norm(points[0] - points[0].mean(0), axis=1).max())
@@ -86,7 +87,7 @@ def start(scene, dataset, settings) -> Fit:
         points = _with_surroundings(points, dataset, settings)
     light = scene.environment
     model = Model.start(*points, light.texels.numpy(), light.rotation, settings.sh_order, settings.seed,
-                        settings.start.scale, opacity, settings.start.roughness, settings.shader,
+                        begin.scale, opacity, begin.roughness, settings.shader,
                         two_sided=None if shading.box is None else True)
     return Fit(dataset, model, settings, extent, shading, _priors(dataset, settings))
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy import ndimage
 
 from ..aligned import lanes
+from ..progress import Progress
 from . import hull
 
 _WIDTH = 200  # pixels of a photograph's copy at most
@@ -30,15 +31,19 @@ _SEEN_THROUGH = 3  # views that look through what is carved
 _FLAT = 1e-4  # variance of grey levels in a window that shows nothing
 
 
-def carved_hull(views, resolution: int = 160):
-    """`hull.visual_hull` of ``views``, less what they look through: a `hull.SignedField`. Needs a JIT variant."""
+def carved_hull(views, resolution: int = 160, quiet: bool = True) -> hull.SignedField:
+    """`hull.visual_hull` of ``views``, less what they look through; ``quiet``: no progress. Needs a JIT variant."""
     field = hull.visual_hull(views, resolution)
     vertices, faces, _ = hull.surface(field)
     small = [Small.of(view) for view in views]
     depths = hull.depth_maps(vertices, faces, [s.camera for s in small])
     radius = float(np.linalg.norm(vertices - vertices.mean(0), axis=1).max())
     step = _REACH * radius / _LEVELS
-    deeper = [sweep(i, small, depths, step) for i in range(len(small))]
+    deeper = []
+    with Progress(quiet=quiet, label="looking below the visual hull") as progress:
+        for i in range(len(small)):
+            deeper.append(sweep(i, small, depths, step))
+            progress.update((i + 1) / len(small), views=i + 1)
     return carve(field, small, depths, _agreed(small, depths, deeper, step), step)
 
 
