@@ -1,5 +1,5 @@
 import pytest
-from runs import make_inputs
+from runs import end_all, make_inputs
 
 import rgs_mi
 
@@ -8,6 +8,13 @@ import rgs_mi
 def variant():
     """Every test runs in the variant that the package is for; a test that changes it is put right again."""
     rgs_mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture(autouse=True)
+def processes():
+    """What a test starts ends with it."""
+    yield
+    end_all()
 
 
 @pytest.fixture(scope="session")

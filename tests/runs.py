@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -35,7 +36,33 @@ def make_suite(scene: Path, data: Path, folder: Path, *names) -> tuple[Path, Pat
     return scene, folder
 
 
+PATIENCE = 200  # seconds, on a busy machine
+_started = []
+
+
+def start(*command, **options) -> subprocess.Popen:
+    """Start a process, which does not outlive the test."""
+    _started.append(subprocess.Popen([sys.executable, *map(str, command)], **options))
+    return _started[-1]
+
+
 def start_script(name, *arguments) -> subprocess.Popen:
     """Start a script of the project in a process of its own."""
-    return subprocess.Popen([sys.executable, str(ROOT / "scripts" / name), *map(str, arguments)], text=True,
-                            stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    return start(ROOT / "scripts" / name, *arguments, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+def end_all():
+    """Kill what a failed test has left running."""
+    while _started:
+        process = _started.pop()
+        if process.poll() is None:
+            process.kill()
+
+
+def wait_for(condition, process=None):
+    """Until ``condition()`` holds, while ``process`` goes on."""
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, "too slow"
+        assert process is None or process.poll() is None, process.stderr and process.stderr.read()
+        time.sleep(0.05)

@@ -6,14 +6,12 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
-from runs import ROOT, TARGET, make_suite, start_script
+from runs import PATIENCE, ROOT, TARGET, make_suite, start, start_script, wait_for
 
 from rgs_mi import ablate, apart, comparison, jobs, results
 from rgs_mi.config import completed, to_dict
@@ -181,9 +179,9 @@ def test_stopped_and_gone_on(suite, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     process = start_script("ablate.py", *command, "--set", "iterations=1000000")
     run = tmp_path / "out" / "one" / "baseline"
-    wait_for(lambda: any((run / "checkpoints").glob("step_*[1-9].npz")))
+    wait_for(lambda: any((run / "checkpoints").glob("step_*[1-9].npz")), process)
     process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=40)
+    _, error = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130 and "same command goes on" in error and "Traceback" not in error, error
     reached = json.loads((run / results.METRICS).read_text())["iterations"]
     assert reached > 0 and read(tmp_path / "out")["runs"][0]["status"] == "missing"
@@ -192,7 +190,7 @@ def test_stopped_and_gone_on(suite, tmp_path, monkeypatch):
     for path in run.glob("checkpoints/*.npz"):
         retold(path, iterations=reached + 2)
     process = start_script("ablate.py", *command, "--set", f"iterations={reached + 2}")
-    out, error = process.communicate(timeout=40)
+    out, error = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0 and "starting again" not in error and "deferred 2DGS" in out, error
     assert read(tmp_path / "out")["runs"][0]["iterations"] == reached + 2
 
@@ -251,18 +249,11 @@ if __name__ == "__main__":
 def test_saves_when_its_parent_ends(tmp_path, number):
     script, file = tmp_path / "parent.py", tmp_path / "file"
     script.write_text(PARENT)
-    process = subprocess.Popen([sys.executable, str(script), str(file)], stderr=subprocess.DEVNULL)
-    wait_for(lambda: file.is_file() and file.read_text() == "waiting")
+    process = start(script, file, stderr=subprocess.DEVNULL)
+    wait_for(lambda: file.is_file() and file.read_text() == "waiting", process)
     process.send_signal(number)
     wait_for(lambda: file.read_text() == "saved")
-    process.wait(10)
-
-
-def wait_for(condition, seconds=40):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    process.wait(PATIENCE)
 
 
 # ---- Tables ----

@@ -2,13 +2,12 @@
 
 import json
 import signal
-import time
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
-from runs import start_script
+from runs import PATIENCE, start_script, wait_for
 
 from rgs_mi import checkpoint, losses
 from rgs_mi.errors import UserError
@@ -116,7 +115,7 @@ def test_photographs_without_masks(inputs, tmp_path):
     process = start_script("optimize.py", scene, "--data", tmp_path, "--out", tmp_path / "run", "--quiet",
                            *(word for setting in [*SMALL, "iterations=30", "density.interval=10", "density.start=0",
                                                   "sh_start=0.2", "start.surroundings=100"] for word in ("--set", setting)))
-    _, error = process.communicate(timeout=100)
+    _, error = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0 and error == "", error
     figures = metrics(tmp_path / "run")
     assert figures["finished"] and figures["psnr"] > 8 and figures["normal_mae_deg"] is None
@@ -213,11 +212,9 @@ def test_interrupt(inputs, tmp_path):
     scene, data = inputs
     process = start_script("optimize.py", scene, "--data", data, "--out", tmp_path, "--set", "iterations=1000000",
                            "--set", "start.surfels=300", "--set", "checkpoint_seconds=0")
-    end = time.monotonic() + 40
-    while time.monotonic() < end and not any((tmp_path / "checkpoints").glob("step_*[1-9].npz")):
-        time.sleep(0.05)
+    wait_for(lambda: any((tmp_path / "checkpoints").glob("step_*[1-9].npz")), process)
     process.send_signal(signal.SIGINT)
-    out, error = process.communicate(timeout=40)
+    out, error = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, error
     assert "--resume" in out and "Traceback" not in error
     figures = metrics(tmp_path)
@@ -245,7 +242,7 @@ def test_mistakes(inputs, tmp_path):
     }
     processes = {text: start_script("optimize.py", *arguments) for text, arguments in cases.items()}
     for text, process in processes.items():
-        out, error = process.communicate(timeout=60)
+        out, error = process.communicate(timeout=PATIENCE)
         assert process.returncode == 2, (text, out, error)
         assert error.startswith("error: ") and len(error.splitlines()) == 1 and text in error, (text, error)
 

@@ -9,7 +9,7 @@ import time
 import drjit as dr
 import pytest
 from captures import photographs, write_colmap, write_nerfstudio, write_nero
-from runs import make_suite, start_script
+from runs import PATIENCE, make_suite, start_script, wait_for
 
 from rgs_mi import apart, comparison, jobs, published, results, suite
 from rgs_mi.errors import UserError
@@ -144,19 +144,12 @@ def test_stopped_and_gone_on(captures, tmp_path, monkeypatch):
     runs = [tmp_path / "out" / name for name in ("car", "helmet")]
     wait_for(lambda: all(any((run / "checkpoints").glob("step_*[1-9].npz")) for run in runs), process)
     process.send_signal(signal.SIGINT)
-    _, error = process.communicate(timeout=60)
+    _, error = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130 and "same command goes on" in error and "Traceback" not in error, error
     for run in runs:
         figures = json.loads((run / results.METRICS).read_text())
         assert figures["iterations"] > 0 and not figures["finished"]
     assert [r["status"] for r in read(tmp_path / "out")["runs"]] == ["missing"] * 2
-
-
-def wait_for(condition, process, seconds=100):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end and process.poll() is None, process.stderr.read() if process.poll() else "too slow"
-        time.sleep(0.05)
 
 
 def work(name, seconds):

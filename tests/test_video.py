@@ -5,7 +5,7 @@ import builtins
 import numpy as np
 import pytest
 from PIL import Image
-from runs import start_script
+from runs import PATIENCE, start_script
 
 from rgs_mi import render, video
 from rgs_mi.camera import Camera
@@ -141,7 +141,7 @@ def test_from_the_command_line(tmp_path):
     pytest.importorskip("imageio_ffmpeg")
     path = scene_of(tmp_path, sensor("a", 0), sensor("b", 20), sensor("c", 40))
     process = start_script("render.py", path, "--path", "--video", "--quiet", "--spp", "4")
-    out, error = process.communicate(timeout=60)
+    out, error = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0, error
     assert [line.rpartition("/")[2] for line in out.split()] == ["a.png", "b.png", "c.png", "video.mp4", "sheet.png"]
     shown, _ = decoded(tmp_path / "path" / "video.mp4")
