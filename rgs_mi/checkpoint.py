@@ -30,23 +30,40 @@ def atomic_file(path):
     path = Path(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(temporary, "wb") as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-        _sync_folder(path.parent)
-    except OSError as error:
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        remedy = "free some space" if full else "check the folder's permissions and free space"
-        raise UserError(f"{path}: can't be written ({error.strerror or error}): {remedy} or choose another folder, "
-                        "what was there before is untouched") from error
+        with _explained(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with open(temporary, "wb") as stream:
+                yield stream
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(temporary, path)
+            _sync_folder(path.parent)
     finally:
         try:
             temporary.unlink(missing_ok=True)
         except OSError:
             pass  # the folder itself is unusable, which is reported above
+
+
+def make_folder(folder):
+    """Make a run's folder, so that one that can't be is found before anything is computed for it.
+
+    Raises: UserError where it can't be made.
+    """
+    with _explained(folder):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+
+
+@contextmanager
+def _explained(path):
+    """What the system says against writing ``path``, as a `UserError`."""
+    try:
+        yield
+    except OSError as error:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        remedy = "free some space" if full else "check the folder's permissions and free space"
+        raise UserError(f"{path}: can't be written ({error.strerror or error}): {remedy} or choose another folder, "
+                        "what was there before is untouched") from error
 
 
 def save(folder, arrays: dict, meta: dict) -> Path:

@@ -238,7 +238,7 @@ def test_mistakes(inputs, tmp_path):
         "integrator is a": [write("path.xml", scene.read_text().replace("rgs_deferred", "path").replace(
             '<string name="diffuse" value="$diffuse"/>', "")), "--data", data],
         "write name=value": [scene, "--data", data, "-D", "width"],
-        "can't be written": [scene, "--data", data, "--out", scene / "run", "--quiet"],
+        "can't be written": [scene, "--data", data, "--out", scene / "run"],
     }
     processes = {text: start_script("optimize.py", *arguments) for text, arguments in cases.items()}
     for text, process in processes.items():

@@ -16,6 +16,7 @@ from scipy import ndimage
 
 from ..aligned import lanes
 from ..progress import Progress
+from ..splat.project import opaque
 from . import hull
 
 _WIDTH = 200  # pixels of a photograph's copy at most
@@ -103,9 +104,9 @@ def alikeness(here, depth, level, others, margin):
     depth, show if it lies at ``depth`` + ``level`` [L]: [L, H, W], the mean of the best few correlations, at least −1.
     That with a view whose frame the point is not in, or whose hull it is more than ``margin`` above, is −1."""
     best = [mi.Float(-1)] * _BEST
-    points = _points(here.camera, depth, level)
+    points, own = _points(here.camera, depth, level), _own(here.grey, len(level))
     for other, surface in others:
-        score = _correlation(here.grey, *_warp(points, other, surface, margin))
+        score = _correlation(own, *_warp(points, other, surface, margin), depth.shape)
         for k in range(_BEST):  # keep the largest, in order
             best[k], score = dr.maximum(best[k], score), dr.minimum(best[k], score)
         dr.eval(best)
@@ -116,11 +117,10 @@ def _points(camera, depth, level):
     """World points below the hull, a lane a level and pixel."""
     filled = np.where(np.isfinite(depth), depth, np.nanmax(depth))
     lane, n = dr.arange(mi.UInt32, filled.size * len(level)), dr.opaque(mi.UInt32, filled.size)
-    number = lambda x: dr.opaque(mi.Float, float(x))  # or each camera would be compiled into kernels of its own
     pixel = lane % n
     z = dr.gather(mi.Float, lanes(filled), pixel) + dr.gather(mi.Float, lanes(level), lane // n)
-    x, y, back = (dr.gather(mi.Float, lanes(camera.rays()[..., k]), pixel) * z + number(camera.origin[k]) for k in range(3))
-    point = mi.Point3f(x, y, back)
+    rays = mi.Vector3f(*(dr.gather(mi.Float, lanes(c), pixel) for c in np.moveaxis(camera.rays(), -1, 0)))
+    point = opaque(camera)[1] + rays * z
     dr.eval(point)
     return point
 
@@ -128,12 +128,13 @@ def _points(camera, depth, level):
 def _warp(points, other, depth, margin):
     """(grey levels of the ``other`` photograph at ``points``, whether these can be its surface: in its frame, not above its
     hull)."""
-    camera, number = other.camera, lambda x: dr.opaque(mi.Float, float(x))
-    width, height = camera.size
-    local = [sum(number(r) * (p - number(o)) for r, p, o in zip(row, points, camera.origin)) for row in camera.rotation]
-    x = local[0] / local[2] * number(camera.focal[0]) + number(camera.principal[0] - 0.5)
-    y = local[1] / local[2] * number(camera.focal[1]) + number(camera.principal[1] - 0.5)
-    inside = (local[2] > 0) & (x >= 0) & (y >= 0) & (x < number(width - 1)) & (y < number(height - 1))
+    number = lambda x: dr.opaque(mi.Float, float(x))
+    rotation, origin, focal, principal = opaque(other.camera)
+    width, height = other.camera.size
+    local = rotation @ mi.Vector3f(points - origin)
+    x = local.x / local.z * focal.x + principal.x - 0.5
+    y = local.y / local.z * focal.y + principal.y - 0.5
+    inside = (local.z > 0) & (x >= 0) & (y >= 0) & (x < number(width - 1)) & (y < number(height - 1))
     column, row = dr.floor(x), dr.floor(y)
     at = mi.UInt32(dr.select(inside, row * number(width) + column, 0))
     grey, right, below = lanes(other.grey), dr.opaque(mi.UInt32, 1), dr.opaque(mi.UInt32, width)
@@ -141,20 +142,26 @@ def _warp(points, other, depth, margin):
     fx, fy = x - column, y - row
     value = dr.lerp(dr.lerp(fetch(0), fetch(right), fx), dr.lerp(fetch(below), fetch(below + right), fx), fy)
     surface = dr.gather(mi.Float, lanes(np.where(np.isfinite(depth), depth, np.inf)), at, inside)
-    inside &= local[2] > surface - number(margin)
+    inside &= local.z > surface - number(margin)
     value = dr.select(inside, value, 1)
     dr.eval(value, inside)
     return value, inside
 
 
-def _correlation(grey, warped, inside):
-    """Normalised cross-correlation of the windows around each pixel of ``grey`` and of its ``warped`` neighbour."""
-    height, width = grey.shape
-    pixel = dr.arange(mi.UInt32, dr.width(warped)) % dr.opaque(mi.UInt32, grey.size)
-    at = lambda image: dr.gather(mi.Float, lanes(image), pixel)
-    mean, square = (at(ndimage.uniform_filter(grey.astype(np.float64)**k, 2 * _WINDOW + 1, mode="nearest"))
-                    for k in (1, 2))
-    m, mm, cross = _means([warped, warped * warped, warped * at(grey)], width, height)
+def _own(grey, levels):
+    """``grey``, its means and its mean squares over windows, a lane a level and pixel."""
+    pixel = dr.arange(mi.UInt32, grey.size * levels) % dr.opaque(mi.UInt32, grey.size)
+    means = (ndimage.uniform_filter(grey.astype(np.float64)**k, 2 * _WINDOW + 1, mode="nearest") for k in (1, 2))
+    own = [dr.gather(mi.Float, lanes(image), pixel) for image in (grey, *means)]
+    dr.eval(own)
+    return own
+
+
+def _correlation(own, warped, inside, shape):
+    """Normalised cross-correlation of the windows around each pixel, whose `_own` these are, and of its ``warped``
+    neighbour."""
+    here, mean, square = own
+    m, mm, cross = _means([warped, warped * warped, warped * here], *shape[::-1])
     spread = dr.sqrt(dr.maximum(square - mean * mean, _FLAT) * dr.maximum(mm - m * m, _FLAT))
     score = dr.select(inside, (cross - m * mean) / spread, -1)
     dr.eval(score)
