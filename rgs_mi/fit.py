@@ -185,6 +185,8 @@ class Fit:
             dr.set_grad(value, dr.select(dr.isfinite(gradient), gradient, 0))  # one overflow must not end a fit
             dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
+        if lighting and s.weights.light > 0:
+            measured.append({"loss.light": self._smooth_light()})
         self.model.optimizer.step()
         dr.eval(measured)
         mean = {name: np.mean([float(m[name][0]) for m in measured if name in m]) for m in measured for name in m}
@@ -229,6 +231,12 @@ class Fit:
         dr.backward(sum(parts.values()) * weight)
         self.gradients.add(dr.grad(offset) / weight, image.gbuffer.seen, photo.size)
         return dr.detach(parts) | {"error": error}
+
+    def _smooth_light(self):
+        """Accumulate the gradient of the environment's own loss, which is returned."""
+        loss = dr.opaque(mi.Float, self.settings.weights.light) * losses.light_variation(self.model[ENVIRONMENT])
+        dr.backward(loss)
+        return dr.detach(loss)
 
     def _regional(self, i, gbuffer, photo):
         """RGS's losses of view ``i`` that are normalised by regions of their own, L_normal and L_depth; notes what is

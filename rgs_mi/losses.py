@@ -6,11 +6,13 @@ import numpy as np
 
 from .aligned import lanes
 from .shading.deferred import COVERED
+from .splat.hit import adding
 from .splat.project import opaque
 
 SATURATED = 0.995  # display value from which a photograph only says "at least this bright"
 _WINDOW, _SIGMA = 11, 1.5  # SSIM's Gaussian window
 _C1, _C2 = 0.01**2, 0.03**2
+_SLOPE = 4.0  # change of log radiance per radian up to which it counts by its square
 _FLAT = 1e-6  # standard deviation of a depth map, in units of its depth, up to which it is constant
 
 
@@ -174,6 +176,29 @@ def pearson_depth(depth, prior, valid, inverse=False):
     defined = (spread_x > 0) & (spread_y > 0)
     r = dr.sum(x * y) / dr.select(defined, spread_x * spread_y, 1)
     return dr.select(defined, 1 - r, 0)
+
+
+def light_variation(log_radiance):
+    """Total variation of an environment, 1/4π ∫ |∇ log L| dω per radian, summed over channels: each derivative d, along rows
+    and columns, counts as √(d² + `_SLOPE`²) − `_SLOPE`, so that noise weighs less than edges.
+
+    ``log_radiance``: ``mi.TensorXf`` [rows, columns, 3], rows from pole to pole as in `Environment`.
+    """
+    rows, columns, _ = log_radiance.shape
+    polar, azimuthal = np.pi / (rows - 1), 2 * np.pi / columns  # angles from texel to texel
+    index = dr.arange(mi.UInt32, rows * columns)
+    row, column = index // columns, index % columns
+    at = lambda i, active: dr.gather(mi.Color3f, log_radiance.array, i, active, mode=adding(3 * rows * columns))
+    length = lambda d: dr.sum(dr.sqrt(dr.square(d) + _SLOPE**2) - _SLOPE)
+    sine = dr.sin(mi.Float(row) * polar)
+    ring = (row > 0) & (row + 1 < rows)  # the poles are points
+    here = at(index, True)
+    right = at(dr.select(column + 1 < columns, index + 1, index + 1 - columns), ring)
+    along = (right - here) / dr.select(ring, azimuthal * sine, 1)
+    middle = dr.sin((mi.Float(row) + 0.5) * polar)
+    down = (at(index + columns, row + 1 < rows) - here) / polar
+    total = dr.select(ring, length(along) * sine, 0) + dr.select(row + 1 < rows, length(down) * middle, 0)
+    return dr.sum(total) * (polar * azimuthal / (4 * np.pi))
 
 
 def _centred(x, valid, count):

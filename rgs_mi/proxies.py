@@ -59,12 +59,12 @@ class Proxies:
             self.scene = mi.load_dict({"type": "scene", "proxies": mesh})
         self.two_sided = surfels.two_sided
 
-    def meet(self, origin, normal, direction):
-        """(found, number): whether the ray of a lane meets the front of a surfel, and which. ``normal``: of the surface that
-        the rays leave."""
+    def meet(self, origin, normal, direction, active=True):
+        """(found, number): whether the ray of an ``active`` lane meets the front of a surfel, and which. ``normal``: of the
+        surface that the rays leave."""
         with dr.suspend_grad():
             ray = mi.Ray3f(mi.Point3f(origin + self.clearance * normal), mi.Vector3f(direction))
-            hit = self.scene.ray_intersect_preliminary(ray, coherent=False)
+            hit = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
             found, number = hit.is_valid(), hit.prim_index // 2
             if not self.two_sided:
                 found &= dr.dot(dr.gather(mi.Vector3f, self.normal, number, found), ray.d) < 0

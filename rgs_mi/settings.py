@@ -63,6 +63,7 @@ class Weights:
     crease: float = _within(0.1, 0, 1e3)  # difference of unit normals from pixel to pixel that it lets be; 0: none
     delta_normal: float = _within(0.0, 0, 1e3)  # length of the normals' residuals (RGS, L_Δn)
     depth: float = _within(1e-3, 0, 1e3)  # correlation with the depth prior (RGS, L_depth)
+    light: float = _within(1e-5, 0, 1e3)  # total variation of the environment: what nothing reflects sharply stays smooth
 
 
 @dataclass(frozen=True)

@@ -131,13 +131,26 @@ def test_kinds():
     assert abs(array(image(surfels, None))[where] - LIGHT).max() < 1e-3
 
 
+@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.parametrize("roughness, part", [(0.2, 1), (0.25, 0.75), (0.35, 0.25), (0.4, 0)])
+def test_what_is_rough_reflects_no_surfels_with_a_radiance_of_their_own(roughness, part, sampled):
+    base = corner().numpy()
+    surfels = Surfels.from_numpy(base | {"roughness": np.where(base["roughness"] < 0.5, roughness, base["roughness"]).astype(
+        np.float32)}, two_sided=False)
+    shade = lambda *how: array(deferred.render(surfels, CAMERA, lighting(surfels, *how)).specular)
+    free, wholly, mine = shade(None, sampled), shade("visibility", sampled, True), shade("visibility", sampled)
+    hidden, where = free - wholly, floor_reflecting(truth(), WALL)
+    assert hidden[where].min() > 0.05
+    assert np.allclose((free - mine)[where], part * hidden[where], atol=2e-3)
+
+
 def test_gradients_equal_finite_differences():
     """In what the surfels send to each other, and in the environment: rays stay where they are."""
     rng = np.random.default_rng(1)
     surfels = corner()
     base = surfels.numpy()
     shape = base["roughness"].shape
-    base |= {"roughness": np.full(shape, 0.15, np.float32), "metallic": np.full(shape, 0.6, np.float32),
+    base |= {"roughness": np.full(shape, 0.28, np.float32), "metallic": np.full(shape, 0.6, np.float32),
              "sh": base["sh"] + np.float32(0.5),  # a radiance of zero is a kink
              "base_color": rng.uniform(0.3, 0.8, base["base_color"].shape).astype(np.float32)}
     base["texels"] = rng.uniform(0.3, 0.9, (16, 32, 3)).astype(np.float32)
@@ -163,12 +176,12 @@ def test_gradients_equal_finite_differences():
         assert (gradient * direction).sum() == pytest.approx(expected, rel=rel), name
 
 
-def lit(surfels, kind, sampled=False):
-    """The `Lighting` of ``surfels`` that a constant light lights diffusely, too; ``kind``: of `Indirect`, None: without."""
+def lighting(surfels, kind, sampled=False, lit=False):
+    """The `Lighting` of ``surfels`` by a constant light; ``kind``: of `Indirect`, None: without."""
     environment = Environment(mi.TensorXf(np.full((16, 32, 3), LIGHT, np.float32)), np.eye(3))
     estimator = SplitSum(environment.filtered()) if not sampled else MonteCarlo(
         environment.unfiltered(), environment.emitter(), DEFAULT_ETA, 256, mi.UInt32(0))
-    return deferred.Lighting(estimator, indirect=kind and Indirect(kind, Proxies(surfels), surfels), lit=True)
+    return deferred.Lighting(estimator, indirect=kind and Indirect(kind, Proxies(surfels), surfels), lit=lit)
 
 
 def disc_over_a_patch(height=0.5, radius=0.4):
@@ -190,8 +203,8 @@ def disc_over_a_patch(height=0.5, radius=0.4):
 def test_share_of_diffuse_light_under_a_disc(two_sided):
     """(9) under a constant light: a disc hides r²/(r² + h²) of a hemisphere's cosine."""
     surfels = replace(disc_over_a_patch(), two_sided=two_sided)
-    lighting = lit(surfels, "visibility")
-    share = np.mean([lighting.with_share(seed).indirect.share.numpy()[:, 0] for seed in range(40)], 0)
+    light = lighting(surfels, "visibility", lit=True)
+    share = np.mean([light.with_share(seed).indirect.share.numpy()[:, 0] for seed in range(40)], 0)
     radius, height = 0.4 + 0.02, 0.5 - 0.02  # quads reach nearly two standard deviations; rays start as far above
     below = share[0] == 1  # where a surfel that shows from behind is hidden by nothing
     assert below if two_sided else share[0] == pytest.approx(1 - radius**2 / (radius**2 + height**2), abs=0.01)
@@ -203,7 +216,8 @@ def test_diffuse_light_of_split_sum_is_that_of_monte_carlo(kind):
     base = corner().numpy()
     surfels = Surfels.from_numpy(base | {"metallic": np.zeros_like(base["metallic"]), "roughness": np.ones_like(
         base["roughness"]), "base_color": np.full_like(base["base_color"], 0.2)}, two_sided=False)
-    lightings = lit(surfels, kind, sampled=True), lit(surfels, None), lit(surfels, kind).with_share()
+    lightings = [lighting(surfels, *how, lit=True) for how in ((kind, True), (None,), (kind,))]
+    lightings[2] = lightings[2].with_share()
     expected, free, shared = (array(deferred.render(surfels, CAMERA, l).diffuse)[..., 0] for l in lightings)
     floor = floor_reflecting(truth(), WALL)
     error = lambda image: abs(image - expected)[floor].mean() / expected[floor].mean()

@@ -203,3 +203,41 @@ def test_pearson_depth_compiles_once():
         pearson(*depths(5, 333))
         history = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
     assert len(history) > 5 and all(k["cache_hit"] for k in history)
+
+
+def light_variation_twin(x):
+    """Derivatives of log radiance ``x`` [rows, columns, 3] on the sphere, one after another."""
+    rows, columns, _ = x.shape
+    polar, azimuthal = np.pi / (rows - 1), 2 * np.pi / columns
+    total = 0
+    length = lambda d: (np.sqrt(d * d + 16) - 4).sum()
+    for r in range(rows):
+        for c in range(columns):
+            if 0 < r < rows - 1:
+                sine = np.sin(r * polar)
+                total += sine * length((x[r, (c + 1) % columns] - x[r, c]) / (azimuthal * sine))
+            if r < rows - 1:
+                total += np.sin((r + 0.5) * polar) * length((x[r + 1, c] - x[r, c]) / polar)
+    return total * polar * azimuthal / (4 * np.pi)
+
+
+def test_light_variation_and_its_gradient():
+    x = np.random.default_rng(5).normal(size=(5, 8, 3))
+    leaf = mi.TensorXf(x.astype(np.float32))
+    dr.enable_grad(leaf)
+    value = losses.light_variation(leaf)
+    assert value[0] == pytest.approx(light_variation_twin(x), rel=1e-5)
+    dr.backward(value)
+    direction = np.random.default_rng(6).normal(size=x.shape)
+    expected = (light_variation_twin(x + 1e-5 * direction) - light_variation_twin(x - 1e-5 * direction)) / 2e-5
+    assert (dr.grad(leaf).numpy() * direction).sum() == pytest.approx(expected, rel=1e-4)
+
+
+def test_light_variation_does_not_depend_on_resolution():
+    def waves(rows):
+        theta, phi = np.meshgrid(np.linspace(0, np.pi, rows), (np.arange(2 * rows) + 0.5) / rows * np.pi, indexing="ij")
+        value = 20 * np.sin(theta) * np.cos(phi)
+        return losses.light_variation(mi.TensorXf(np.repeat(value[..., None], 3, -1).astype(np.float32)))[0]
+
+    assert waves(128) == pytest.approx(waves(256), rel=1e-2)
+    assert losses.light_variation(mi.TensorXf(np.full((16, 32, 3), 7.0, np.float32)))[0] == pytest.approx(0, abs=1e-5)

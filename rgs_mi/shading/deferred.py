@@ -14,6 +14,9 @@ from .shader import Shader
 from .split_sum import DEFAULT_ETA, SplitSum
 
 COVERED = 4e-3  # pixels with less alpha are left empty
+# Roughness up to which surfels with a radiance of their own are reflected wholly, and from which on not at all: what a rough
+# surface receives of them is blurred, and already in its own radiance.
+_NARROW, _WIDE = 0.2, 0.4
 
 
 @dataclass(frozen=True)
@@ -43,19 +46,21 @@ class Lighting:
     def specular(self, normal, view, roughness, metallic, base_color, point=None):
         """f_φ(C_s), radiance that surfaces reflect towards ``view``, ``mi.Color3f``; see `SplitSum.specular`. ``point``:
         where the surfaces are, which `indirect` needs (None: they reflect the environment alone)."""
-        cover = self._cover(normal, point)
+        cover = self._cover(normal, point, roughness)
         C_s = self.estimator.specular(normal, view, roughness, metallic, base_color, cover)
         return C_s if self.shader is None else self.shader(C_s, roughness, dr.dot(normal, view))
 
     def diffuse(self, normal, view, roughness, metallic, base_color, point=None, share=1):
         """C_d where it is ``lit``; as `specular`. ``share``: of the light, that comes there."""
-        return self.estimator.diffuse(normal, view, roughness, metallic, base_color, self._cover(normal, point), share)
+        cover = self._cover(normal, point, roughness)
+        return self.estimator.diffuse(normal, view, roughness, metallic, base_color, cover, share)
 
-    def _cover(self, normal, point):
+    def _cover(self, normal, point, roughness):
         """What an estimator asks what comes along a direction; None: the environment's radiance does."""
         def cover(light, direction, lane):
             at = lambda v: v if lane is None else dr.gather(type(v), v, lane)
-            return self.indirect.cover(light, at(point), at(normal), direction, self)
+            part = 1 if self.lit else dr.clip((_WIDE - at(roughness)) / (_WIDE - _NARROW), 0, 1)
+            return self.indirect.cover(light, at(point), at(normal), direction, self, part)
 
         return None if point is None else cover
 

@@ -37,17 +37,18 @@ class Indirect:
     surfels: Surfels
     share: "mi.Color3f | None" = None
 
-    def cover(self, incoming, point, normal, direction, lighting):
-        """``incoming`` radiance along ``direction``, a lane a pixel, where nothing stands in the way; that of the surfels
-        elsewhere."""
-        dr.eval(incoming, point, normal, direction)
-        found, number = self.proxies.meet(dr.detach(point), dr.detach(normal), dr.detach(direction))
+    def cover(self, incoming, point, normal, direction, lighting, part=1):
+        """``incoming`` radiance along ``direction``, a lane a pixel, where nothing stands in the way; elsewhere the surfels'
+        takes the place of a ``part`` of it."""
+        part = mi.Float(part)
+        dr.eval(incoming, point, normal, direction, part)
+        found, number = self.proxies.meet(*(dr.detach(v) for v in (point, normal, direction)), dr.detach(part) > 0)
         lanes = dr.compress(found)
         light = dr.zeros(mi.Color3f, dr.width(found))
         if self.kind == "one_bounce" and dr.width(lanes) > 0:
             d = mi.Vector3f(*(dr.gather(mi.Float, c, lanes, mode=dr.ReduceMode.NoConflicts) for c in direction))
             dr.scatter(light, self._radiance(dr.gather(mi.UInt32, number, lanes), d, lighting), lanes)
-        return dr.select(found, light, incoming)
+        return dr.select(found, dr.lerp(incoming, light, part), incoming)
 
     def with_share(self, lighting, seed) -> "Indirect":
         """The same with `share`, where surfels are lit by ``lighting``, whose estimator is the split sum; ``seed``:
