@@ -2,7 +2,8 @@
 
 Where the reflected ray meets a surfel, the light that comes along it is that surfel's own radiance, diffuse and specular
 (`one_bounce`), or nothing (`visibility`), instead of the environment. The hit itself is piecewise constant in what moves it:
-gradients flow into the radiance of what is hit and its direction, not into which surfel is hit.
+gradients flow into the radiance of what is hit and its direction, not into which surfel is hit. One ray says little about
+the wide lobe of a rough surface: where that has a radiance of its own, which carries such light blurred, no ray is traced.
 
 A diffuse lobe has no one direction to trace. Of it each surfel knows how much of the light L that the environment has for it
 the others let through, or send in its place:
