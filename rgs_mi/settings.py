@@ -81,7 +81,7 @@ class Density:
     start: float = _within(0.08, 0, 1)  # fraction of the fit
     stop: float = _within(0.6, 0, 1)
     interval: int = _within(100, 1, 100_000)  # steps
-    threshold: float = _within(2e-4, 0, 1)  # positional gradient in NDC units
+    threshold: float = _within(1e-4, 0, 1)  # positional gradient in NDC units; half of 2DGS's: rather many surfels
     dense: float = _within(0.01, 0, 1)  # surfels smaller than this (in units of the object) are cloned, others split
     prune_opacity: float = _within(0.05, 0, 1)
     max_surfels: int | None = _within(None, 1, 10_000_000)  # unless given: see `Settings.max_surfels`
