@@ -180,7 +180,7 @@ def pearson_depth(depth, prior, valid, inverse=False):
 
 def light_variation(log_radiance):
     """Total variation of an environment, 1/4π ∫ |∇ log L| dω per radian, summed over channels: each derivative d, along rows
-    and columns, counts as √(d² + `_SLOPE`²) − `_SLOPE`, so that noise weighs less than edges.
+    and columns, counts as √(d² + `_SLOPE`²) − `_SLOPE`: gentle slopes by their square, edges by their height.
 
     ``log_radiance``: ``mi.TensorXf`` [rows, columns, 3], rows from pole to pole as in `Environment`.
     """

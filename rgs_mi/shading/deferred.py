@@ -14,8 +14,8 @@ from .shader import Shader
 from .split_sum import DEFAULT_ETA, SplitSum
 
 COVERED = 4e-3  # pixels with less alpha are left empty
-# Roughness up to which surfels with a radiance of their own are reflected wholly, and from which on not at all: what a rough
-# surface receives of them is blurred, and already in its own radiance.
+# Roughness up to which a surface with a radiance of its own reflects the other surfels wholly, and from which on not at all:
+# what it receives of them is blurred then, and already in that radiance.
 _NARROW, _WIDE = 0.2, 0.4
 
 
