@@ -1,7 +1,12 @@
+import signal
+
 import pytest
 from runs import end_all, make_inputs
 
 import rgs_mi
+
+# A shell that starts the tests in the background has them ignore Ctrl-C, which processes that they start would inherit.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True)
