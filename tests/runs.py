@@ -36,7 +36,7 @@ def make_suite(scene: Path, data: Path, folder: Path, *names) -> tuple[Path, Pat
     return scene, folder
 
 
-PATIENCE = 200  # seconds, on a busy machine
+PATIENCE = 100  # seconds, on a busy machine
 _started = []
 
 

@@ -253,7 +253,7 @@ def test_saves_when_its_parent_ends(tmp_path, number):
     wait_for(lambda: file.is_file() and file.read_text() == "waiting", process)
     process.send_signal(number)
     wait_for(lambda: file.read_text() == "saved")
-    process.wait(PATIENCE)
+    process.wait(10)
 
 
 # ---- Tables ----
