@@ -10,7 +10,7 @@ Flat Gaussians with a principled material (`rgs_mi.surfel.Surfels`), for the int
    - |string|
    - PLY of surfels, from rgs_mi, 2DGS or 3DGS; relative to the scene's folder (Default: no surfels)
 
- * - centers, rotations, scales, opacities, sh, base_color, roughness, metallic, delta_normal
+ * - centers, rotations, scales, opacities, sh, base_color, roughness, metallic, delta_normal, curvature
    - |tensor|
    - The fields themselves, in physical ranges; in a dictionary only. They replace those of the file.
    - |exposed|, |differentiable|; the first three also |discontinuous|
@@ -34,7 +34,7 @@ Flat Gaussians with a principled material (`rgs_mi.surfel.Surfels`), for the int
    - A :monosp:`principled` BSDF: the dielectric lobe has its constant ``eta`` or ``specular`` as it was when loaded,
      the rest of it is ignored. (Default: eta = 1.5)
 
-Tensors of another length may be assigned, which is how a fit adds and removes surfels: all nine before
+Tensors of another length may be assigned, which is how a fit adds and removes surfels: all ten before
 ``params.update()``. Surfels live in world space: a ``to_world`` is an error. Without proxies rays meet nothing, yet
 ``bbox()`` is right, by means of one triangle of no area along its diagonal.
 """
@@ -171,10 +171,13 @@ def resolve(path: str) -> str:
 
 
 def _load(props):
-    """The fields of the PLY, or empty ones."""
+    """The fields of the PLY, or empty ones; what properties leave out of these can only be the curvature, which is 0."""
     if "filename" in props:
         return {name: mi.TensorXf(array) for name, array in read_ply(resolve(props["filename"])).items()}
-    return {name: dr.zeros(mi.TensorXf, (0, channels or 3)) for name, channels in CHANNELS.items()}
+    empty = {name: dr.zeros(mi.TensorXf, (0, channels or 3)) for name, channels in CHANNELS.items()}
+    if "centers" in props:
+        empty["curvature"] = dr.zeros(mi.TensorXf, (mi.TensorXf(props["centers"]).shape[0], 3))
+    return empty
 
 
 def _eta(shape, props):

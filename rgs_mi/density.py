@@ -55,15 +55,19 @@ def densify(model, gradients: Gradients, extent: float | np.ndarray, settings, r
 
     stay = np.flatnonzero(keep)
     index = np.concatenate([stay, clone, split])
-    changes = {name: model.numpy(name)[index] for name in ("centers", "log_scales", "logit_opacities")}
+    changed = "centers", "log_scales", "logit_opacities", "delta_normal", "curvature"
+    changes = {name: model.numpy(name)[index] for name in changed}
     changes["fresh"] = np.arange(len(index)) >= len(stay)
 
-    # Both halves of a split are drawn from the parent; they lie in its plane.
+    # Both halves of a split are drawn from the parent; they lie in its plane, with the normals it has where they are.
     parents = np.isin(stay, split)
     halves = np.concatenate([np.flatnonzero(parents), np.arange(len(stay) + len(clone), len(index))])
-    t_u, t_v, _ = (v.numpy().T[index[halves]] for v in _frames(model))
-    jitter = rng.normal(size=(len(halves), 2)) * scales[index[halves]]
-    changes["centers"][halves] += (jitter[:, :1] * t_u + jitter[:, 1:] * t_v).astype(np.float32)
+    (t_u, t_v), slopes = ([v.numpy().T[index[halves]] for v in pair] for pair in _tangents(model))
+    u, v = rng.normal(size=(len(halves), 2)).astype(np.float32).T[..., None]
+    s_u, s_v = scales[index[halves], :, None].transpose(1, 0, 2)
+    changes["centers"][halves] += u * s_u * t_u + v * s_v * t_v
+    changes["delta_normal"][halves] += u * slopes[0] + v * slopes[1]
+    changes["curvature"][halves] /= _SPLIT_SCALE
     changes["log_scales"][halves] -= np.log(_SPLIT_SCALE)
     # Two surfels on one spot cover as much as one did: 1 − (1 − o')² = o.
     twins = np.concatenate([np.flatnonzero(np.isin(stay, clone)), np.arange(len(stay), len(stay) + len(clone))])
@@ -71,7 +75,8 @@ def densify(model, gradients: Gradients, extent: float | np.ndarray, settings, r
     model.select(index, changes)
 
 
-def _frames(model):
+def _tangents(model):
+    """(t_u, t_v) and (∂n/∂u, ∂n/∂v) of all surfels."""
     surfels: Surfels = model.surfels(0)
     with dr.suspend_grad():
-        return surfels.frames()
+        return surfels.frames()[:2], surfels.slopes()

@@ -25,7 +25,8 @@ from .surfel import CHANNELS, Surfels
 #: Rate of each parameter: the field of `Rates` that it obeys.
 _RATES = {"centers": "centers", "rotations": "rotations", "log_scales": "scales", "logit_opacities": "opacities",
           "sh_dc": "sh_dc", "sh_rest": "sh_rest", "logit_base_color": "base_color", "logit_roughness": "roughness",
-          "logit_metallic": "metallic", "delta_normal": "delta_normal", ENVIRONMENT: "environment", SHADER: "shader"}
+          "logit_metallic": "metallic", "delta_normal": "delta_normal", "curvature": "curvature",
+          ENVIRONMENT: "environment", SHADER: "shader"}
 _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
 _DIVERGED = 10  # steps in a row without a finite error
 
@@ -213,7 +214,7 @@ class Fit:
         w, size = self.settings.weights, photo.camera.size
         offset = dr.zeros(mi.Vector2f, len(self.model))
         dr.enable_grad(offset)
-        image = deferred.render(surfels, photo.camera, lighting, offset, squares=w.distortion > 0)
+        image = deferred.render(surfels, photo.camera, lighting, offset, full=max(w.distortion, w.delta_normal) > 0)
         maps = image.gbuffer.all
         rendered = losses.display(image.color, maps.alpha, self.settings.background)
         parts = {"loss.photometric": losses.photometric(rendered, photo.color, size, w.dssim)}

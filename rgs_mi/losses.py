@@ -127,7 +127,7 @@ def depth_normal_consistency(gbuffer, camera):
 
 def distortion(maps, extent):
     """2DGS's depth distortion, mean over the image of Σ_ij w_i w_j (t_i − t_j)² = 2 (Σw Σwt² − (Σwt)²), in units of
-    ``extent``², the object's radius: surfels along a ray draw together. ``maps``: `Maps` with squares."""
+    ``extent``², the object's radius: surfels along a ray draw together. ``maps``: all `Maps`."""
     return dr.mean(2 * (maps.alpha * maps.square - dr.square(maps.depth))) / dr.opaque(mi.Float, float(extent) ** 2)
 
 
@@ -151,7 +151,7 @@ def normal_smoothness(gbuffer, reflective, crease=0.0):
 
 
 def delta_normal(gbuffer):
-    """RGS's L_Δn: mean ‖ΔN‖ over the image."""
+    """RGS's L_Δn: mean ‖ΔN‖ over the image, of which ``gbuffer`` has all maps."""
     length2 = dr.squared_norm(gbuffer.all.delta_normal)
     nonzero = length2 > 0
     return dr.sum(dr.select(nonzero, dr.sqrt(dr.select(nonzero, length2, 1)), 0)) / (gbuffer.size[0] * gbuffer.size[1])

@@ -11,7 +11,7 @@ from .surfel import SH_0, Surfels
 
 #: Unconstrained parameters, a row a surfel.
 SURFEL_PARAMETERS = ("centers", "rotations", "log_scales", "logit_opacities", "sh_dc", "sh_rest", "logit_base_color",
-                     "logit_roughness", "logit_metallic", "delta_normal")
+                     "logit_roughness", "logit_metallic", "delta_normal", "curvature")
 ENVIRONMENT, SHADER = "log_environment", "shader"
 #: The step of 3DGS's optimisers is relative to the gradient's own size, however small.
 _EPSILON = 1e-15
@@ -68,6 +68,7 @@ class Model:
             "logit_roughness": np.full((n, 1), logit(roughness)),
             "logit_metallic": np.full((n, 1), logit(0.4)),
             "delta_normal": np.zeros((n, 3)),
+            "curvature": np.zeros((n, 3)),
             ENVIRONMENT: np.log(np.maximum(environment, 1e-3)),
             **({SHADER: initial_weights(seed)} if shader == "mlp" else {}),
         }, rotation, two_sided)
@@ -87,7 +88,7 @@ class Model:
         scales = dr.maximum(dr.exp(p["log_scales"]), _LEAST_SCALE)
         return Surfels(p["centers"], p["rotations"], scales, _sigmoid(p["logit_opacities"]), sh,
                        _sigmoid(p["logit_base_color"]), _sigmoid(p["logit_roughness"]), _sigmoid(p["logit_metallic"]),
-                       p["delta_normal"], self.two_sided)
+                       p["delta_normal"], p["curvature"], self.two_sided)
 
     def environment(self) -> Environment:
         """The environment, non-negative by construction."""
@@ -141,7 +142,8 @@ class Model:
     def from_state(cls, arrays: dict) -> "Model":
         """The model that wrote ``state()``."""
         names = [name for name in (*SURFEL_PARAMETERS, ENVIRONMENT, SHADER) if name in arrays]
-        model = cls({name: arrays[name] for name in names}, arrays["rotation"], arrays["two_sided"])
+        flat = {"curvature": np.zeros((len(arrays["centers"]), 3))}  # as in checkpoints of version 0.1.0
+        model = cls(flat | {name: arrays[name] for name in names}, arrays["rotation"], arrays["two_sided"])
         for name in names:
             model._set_moments(name, mi.UInt32(int(arrays[f"{name}.t"])), *(lanes(arrays[f"{name}.{k}"]) for k in "mv"))
         return model

@@ -2,7 +2,7 @@
 
 A vertex holds ``x y z nx ny nz f_dc_0..2 f_rest_* opacity scale_0..2 rot_0..3`` as those viewers read it: opacity as a
 logit, scales as logarithms, the quaternion as (w, x, y, z), SH channel-major. The material follows in plain values,
-under names that viewers ignore: ``base_color_0..2 roughness metallic delta_normal_0..2``.
+under names that viewers ignore: ``base_color_0..2 roughness metallic delta_normal_0..2 curvature_0..2``.
 """
 
 import re
@@ -33,7 +33,9 @@ _MATERIAL = {
     "roughness": (("roughness",), 0.5),
     "metallic": (("metallic",), 0.0),
     "delta_normal": (("delta_normal_0", "delta_normal_1", "delta_normal_2"), 0.0),
+    "curvature": (("curvature_0", "curvature_1", "curvature_2"), 0.0),
 }
+_SIGNED = ("delta_normal", "curvature")  # the others of the material are in [0, 1]
 
 
 def write_ply(path, fields: dict[str, np.ndarray]):
@@ -43,7 +45,7 @@ def write_ply(path, fields: dict[str, np.ndarray]):
       path:   the file; its folder is created if missing
       fields: physical values: centers [N, 3], rotations [N, 4] unit quaternions (x, y, z, w), scales [N, 2] > 0,
               opacities [N, 1] in (0, 1), sh [N, 3*(L+1)^2] coefficient-major (``sh[:, 3*k + c]``), base_color [N, 3],
-              roughness [N, 1], metallic [N, 1], delta_normal [N, 3]
+              roughness [N, 1], metallic [N, 1], delta_normal [N, 3], curvature [N, 3]
 
     Raises: UserError where the disk is full or the folder can't be written.
     """
@@ -74,7 +76,7 @@ def read_ply(path) -> dict[str, np.ndarray]:
     """Read surfels from a PLY of ours, of 2DGS or of 3DGS (whose third scale is ignored); binary or ASCII, L = 0 to 3.
 
     Returns the fields of `write_ply`, float32. What the file lacks of the material is base_color 0.5, roughness 0.5,
-    metallic 0, delta_normal 0.
+    metallic 0, delta_normal 0, curvature 0.
     Raises: UserError where the file is missing, damaged, or holds no surfels.
     """
     path = Path(path)
@@ -92,7 +94,7 @@ def read_ply(path) -> dict[str, np.ndarray]:
     for field, (names, default) in _MATERIAL.items():
         present = any(name in vertices.dtype.names for name in names)
         fields[field] = _columns(path, vertices, names) if present else np.full((n, len(names)), default, np.float32)
-        if field != "delta_normal" and not ((fields[field] >= 0) & (fields[field] <= 1)).all():
+        if field not in _SIGNED and not ((fields[field] >= 0) & (fields[field] <= 1)).all():
             raise UserError(f"{path}: '{field}' lies outside [0, 1]: export the file again, with activated values")
 
     with np.errstate(over="ignore"):

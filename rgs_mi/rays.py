@@ -4,9 +4,10 @@ A ray crosses the quads of `Proxies` front to back. With α_i = o_i exp(−(u² 
 
     w_i = α_i Π_{j<i} (1 − α_j),   A = Σ w_i,   x̄ = Σ w_i x_i / A                                        (8)
 
-are weights, coverage, and the means of distance, normal and material: a G-buffer's (`splat/composite.py`), in the exact
-order of the ray and without the low-pass of pixels. The ray ends on the surfels with probability A, and then on the one
-whose share of A a random number falls into: that one's own radiance has the right mean, Σ w_i c_i.
+are weights, coverage, and the means of distance, normal (n + u ∂n/∂u + v ∂n/∂v) and material: a G-buffer's
+(`splat/composite.py`), in the exact order of the ray and without the low-pass of pixels. The ray ends on the surfels with
+probability A, and then on the one whose share of A a random number falls into: that one's own radiance has the right mean,
+Σ w_i c_i.
 """
 
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ _CUTOFFS = Cutoffs(alpha_min=0.01, transmittance_min=0.01)  # against 1/255 and 
 _STEP = 2e-6  # past a crossing, relative to coordinates: a dozen float32 roundings
 _THICKNESS = 5.0  # of a surface made of surfels, in clearances
 _NONE = 0xFFFFFFFF
-_ROW = 8  # floats
+_SHAPE, _MATERIAL = 12, 8  # floats in a row
 
 
 @dataclass
@@ -49,7 +50,8 @@ class SurfelRays:
         with dr.suspend_grad():
             self.proxies = Proxies(surfels, _CUTOFFS.alpha_min, box)
             column = surfels.column
-            self.shape = pack([column(mi.Float, "opacities"), self.proxies.extent, *self.proxies.normal])
+            self.shape = pack([column(mi.Float, "opacities"), self.proxies.extent, *self.proxies.normal,
+                               *(value for slope in surfels.slopes() for value in slope)])
             self.material = pack([*column(mi.Vector3f, "delta_normal"), *column(mi.Color3f, "base_color"),
                                   column(mi.Float, "roughness"), column(mi.Float, "metallic")])
             self.sh, self.channels = dr.detach(surfels.sh.array), surfels.sh.shape[1]
@@ -74,7 +76,7 @@ class SurfelRays:
             picked = ~found & ((1 - remaining > sample) | ~goes_on)
             number = dr.select(picked, i, number)
             found |= picked
-            row = fetch(self.material, i, _ROW, active & (alpha > 0))
+            row = fetch(self.material, i, _MATERIAL, active & (alpha > 0))
             t += weight * distance
             normal += weight * (facing + mi.Vector3f(*row[:3]))
             base_color += weight * mi.Color3f(*row[3:6])
@@ -122,14 +124,15 @@ class SurfelRays:
         hit = self.proxies.scene.ray_intersect_preliminary(onward, coherent=False, active=active)
         met, number = active & hit.is_valid(), hit.prim_index // 2
         distance = passed + dr.select(met, hit.t, 0)
-        opacity, extent, *normal = fetch(self.shape, number, _ROW, met)[:5]
-        x, y = self.proxies.position(hit)
-        alpha = opacity * dr.exp(-0.5 * extent * extent * (x * x + y * y))
-        normal = mi.Vector3f(*normal)
+        opacity, extent, *vectors = fetch(self.shape, number, _SHAPE, met)[:11]
+        normal, slope_u, slope_v = (mi.Vector3f(*vectors[k:k + 3]) for k in (0, 3, 6))
+        u, v = (extent * value for value in self.proxies.position(hit))
+        alpha = opacity * dr.exp(-0.5 * (u * u + v * v))
         away = dr.dot(normal, ray.d) > 0
         shows = met & (alpha > _CUTOFFS.alpha_min) & (number != last)
         shows &= ~(away & (leaves & (distance < self.thickness))) if self.two_sided else ~away
         alpha = dr.select(shows, dr.minimum(alpha, _CUTOFFS.alpha_max), 0)
+        normal += u * slope_u + v * slope_v
         return met, distance, number, alpha, dr.select(away, -normal, normal)
 
     def _past(self, ray, distance):

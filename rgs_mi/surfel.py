@@ -12,7 +12,7 @@ import numpy as np
 
 #: Channels of each field; `sh` has 3 (L+1)^2 of them, coefficient-major: sh[:, 3 k + c] is coefficient k of colour c.
 CHANNELS = {"centers": 3, "rotations": 4, "scales": 2, "opacities": 1, "sh": None, "base_color": 3, "roughness": 1,
-            "metallic": 1, "delta_normal": 3}
+            "metallic": 1, "delta_normal": 3, "curvature": 3}
 SH_0 = 0.28209479  # the spherical harmonic of order 0
 
 
@@ -27,6 +27,7 @@ class Surfels:
       sh            diffuse radiance, linear: max(0, 1/2 + sum_k sh_k Y_k(d)), d from the camera to the centre (3DGS)
       base_color, roughness, metallic   principled BSDF parameters in [0, 1]
       delta_normal  the residual Δn that is added to the normal (RGS, eq. of N)
+      curvature     K_uu, K_uv, K_vv: how the normal turns across the surfel, radians per √(s_u s_v); see `slopes`
       two_sided     whether surfels show from behind, with the normal turned to the camera (2DGS); one-sided ones, whose
                     normals point outwards, keep the far side of a closed object from bending its silhouette's normals
     """
@@ -40,6 +41,7 @@ class Surfels:
     roughness: "mi.TensorXf"
     metallic: "mi.TensorXf"
     delta_normal: "mi.TensorXf"
+    curvature: "mi.TensorXf"
     two_sided: bool = True
 
     def __len__(self):
@@ -47,7 +49,8 @@ class Surfels:
 
     @classmethod
     def from_numpy(cls, arrays: dict, two_sided=True) -> "Surfels":
-        """From float32 arrays, one a field."""
+        """From float32 arrays, one a field; without ``curvature`` normals are the same all over each surfel."""
+        arrays = {"curvature": np.zeros((len(arrays["centers"]), 3))} | arrays
         return cls(**{name: mi.TensorXf(np.ascontiguousarray(arrays[name], np.float32)) for name in CHANNELS},
                    two_sided=two_sided)
 
@@ -85,6 +88,17 @@ class Surfels:
         t_v = mi.Vector3f(2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w))
         n = mi.Vector3f(2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y))
         return t_u, t_v, n
+
+    def slopes(self):
+        """(∂n/∂u, ∂n/∂v), each ``mi.Vector3f`` of width N: u and v standard deviations from the centre the normal is
+        n + u ∂n/∂u + v ∂n/∂v, as on a surface whose curvature tensor is K / √(s_u s_v). The surfel itself stays flat.
+
+            ∂n/∂u = √(s_u/s_v) (K_uu t_u + K_uv t_v),   ∂n/∂v = √(s_v/s_u) (K_uv t_u + K_vv t_v)
+        """
+        t_u, t_v, _ = self.frames()
+        scales, K = self.column(mi.Vector2f, "scales"), self.column(mi.Vector3f, "curvature")
+        ratio = dr.sqrt(scales.x / scales.y)
+        return ratio * (K.x * t_u + K.y * t_v), (K.y * t_u + K.z * t_v) / ratio
 
     def radiance(self, direction):
         """Diffuse radiance of every surfel seen along unit ``direction`` (from the camera), ``mi.Color3f`` of width N."""

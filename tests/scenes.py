@@ -20,7 +20,8 @@ def sphere_surfels(n, seed=0, scale=0.6, opacity_shift=1.0, order=1):
         "opacities": logistic(rng.normal(size=(n, 1)) + opacity_shift),
         "sh": rng.normal(size=(n, 3 * (order + 1) ** 2)) * 0.1,
         "base_color": rng.uniform(0.2, 0.9, (n, 3)), "roughness": rng.uniform(0.1, 0.9, (n, 1)),
-        "metallic": rng.uniform(0.1, 0.9, (n, 1)), "delta_normal": rng.normal(size=(n, 3)) * 0.05})
+        "metallic": rng.uniform(0.1, 0.9, (n, 1)), "delta_normal": rng.normal(size=(n, 3)) * 0.05,
+        "curvature": 0.3 * rng.normal(size=(n, 3))})
 
 
 def orbit_camera(angle=0.3, size=(48, 40), distance=4.0, fov=38.0):

@@ -66,6 +66,29 @@ def test_large_surfels_are_split_in_their_plane():
     assert np.abs((halves - normal) @ normal).max() < 1e-3 and np.linalg.norm(halves[0] - halves[1]) > 1e-3
 
 
+def test_halves_have_the_normals_that_a_curved_surfel_had_there():
+    m = model()
+    scales, curvature = m.numpy("log_scales"), m.numpy("curvature")
+    scales[3], curvature[3] = np.log([0.1, 0.05]), [0.2, -0.1, 0.3]
+    m.set("log_scales", scales)
+    m.set("curvature", curvature)
+    t_u, t_v, _ = (v.numpy().T[3] for v in m.surfels(0).frames())
+    tensors = lambda: m.surfels(0).curvature.numpy() / np.sqrt(m.surfels(0).scales.numpy().prod(1, keepdims=True))
+    tensor = tensors()[3]
+    centre, residual = m.numpy("centers")[3], m.numpy("delta_normal")[3]
+    hot = np.zeros(N)
+    hot[3] = 1.0
+    densify(m, gradients(hot), 1.0, Density(), np.random.default_rng(0), 1000)
+    assert len(m) == N + 1
+    assert tensors()[[3, N]] == pytest.approx(np.tile(tensor, (2, 1)), rel=1e-4)
+    for half in (3, N):
+        away = m.numpy("centers")[half] - centre
+        x, y = away @ t_u, away @ t_v
+        assert np.hypot(x, y) > 0.01
+        turned = (tensor[0] * x + tensor[1] * y) * t_u + (tensor[1] * x + tensor[2] * y) * t_v
+        assert m.numpy("delta_normal")[half] - residual == pytest.approx(turned, abs=1e-5)
+
+
 def test_transparent_unseen_and_huge_surfels_go():
     m = model()
     opacity, scales, seen = m.numpy("logit_opacities"), m.numpy("log_scales"), np.ones(N, np.float32)
@@ -93,3 +116,11 @@ def test_state_round_trip():
         for a, b in zip(m.optimizer.state[name][3][:3], again.optimizer.state[name][3][:3]):
             assert np.array_equal(np.array(a).ravel(), np.array(b).ravel())
     assert not again.two_sided
+
+
+def test_states_of_before_curvature_are_flat():
+    m = model()
+    state = {name: value for name, value in m.state().items() if not name.startswith("curvature")}
+    old = Model.from_state(state)
+    assert old.numpy("curvature").shape == (N, 3) and not old.numpy("curvature").any()
+    assert (old.numpy("centers") == m.numpy("centers")).all()

@@ -184,7 +184,7 @@ def test_distortion_draws_surfels_together(dataset):
         fit.model.set("centers", fit.model.numpy("centers") * np.linspace(0.9, 1.1, 3)[np.arange(300) % 3, None])
         while fit.progress < 1:
             fit.step()
-        maps = deferred.render(fit.model.surfels(0), dataset.train[0].camera, None, squares=True).gbuffer.all
+        maps = deferred.render(fit.model.surfels(0), dataset.train[0].camera, None, full=True).gbuffer.all
         spread[weight] = losses.distortion(maps, 1.0)[0]
     assert spread[1000.0] < 0.7 * spread[0.0]
 
@@ -197,7 +197,7 @@ def test_no_kernel_is_compiled_after_warm_up(dataset, indirect, diffuse, monkeyp
     settings = replace(SETTINGS, iterations=1000, indirect=indirect, indirect_start=0.0)
     fit = Fit(dataset, model(), settings, 1.0, Shading(diffuse=diffuse))
     centers = fit.model.numpy("centers")
-    fit.model.set("centers", centers + np.where(np.arange(len(centers)) % 2, 0, 1.3)[:, None])  # two balls, side by side
+    fit.model.set("centers", centers + np.where(np.arange(len(centers)) % 2, 0, 1.2)[:, None])  # two balls, side by side
     for n in (290, 270):
         for _ in range(4):
             fit.step()
@@ -212,6 +212,7 @@ def test_no_kernel_is_compiled_after_warm_up(dataset, indirect, diffuse, monkeyp
             fit.step()
         history = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
     assert len(history) > 100 and (len(set(hits)) > 5) == (indirect != "none")
+    assert min(hits[-8:], default=2) > 1  # a single ray takes other kernels
     assert (fit.share is not None) == (diffuse == "lit")
     assert [k["hash"] for k in history if not k["cache_hit"] or k["cache_disk"]] == []  # nor read from earlier sessions
 

@@ -118,7 +118,7 @@ def test_distortion_is_the_sum_over_pairs():
     fields = sphere_surfels(3).numpy() | {
         "centers": np.stack([0 * z, 0 * z, z], 1), "rotations": rotation_from_normal(np.tile([0.0, 0, -1], (3, 1))),
         "scales": np.full((3, 2), 1e3), "opacities": opacity[:, None]}
-    maps = render_gbuffer(Surfels.from_numpy(fields), camera, squares=True).all
+    maps = render_gbuffer(Surfels.from_numpy(fields), camera, full=True).all
     w = opacity * np.concatenate([[1], np.cumprod(1 - opacity)[:-1]])
     expected = (w[:, None] * w * (z[:, None] - z) ** 2).sum()
     assert losses.distortion(maps, extent=2.0)[0] == pytest.approx(expected / 4, rel=1e-3)
@@ -126,7 +126,7 @@ def test_distortion_is_the_sum_over_pairs():
 
 def test_delta_normal_is_its_mean_length():
     surfels, camera = sphere_surfels(50), orbit_camera(size=(32, 32))
-    gbuffer = render_gbuffer(surfels, camera)
+    gbuffer = render_gbuffer(surfels, camera, full=True)
     expected = np.linalg.norm(gbuffer.all.delta_normal.numpy(), axis=0).mean()
     assert losses.delta_normal(gbuffer)[0] == pytest.approx(expected, rel=1e-5)
 

@@ -32,6 +32,9 @@ def brute_force(surfels, origin, direction, reach, leaves):
         t = ((s["centers"] - o) * normal).sum(1) / cosine
         offset = o + t[:, None] * d - s["centers"]
         u, v = ((offset * axis).sum(1) / s["scales"][:, k] for k, axis in enumerate((t_u, t_v)))
+        K_uu, K_uv, K_vv = s["curvature"].T / np.sqrt(s["scales"].prod(1))
+        x, y = u * s["scales"][:, 0], v * s["scales"][:, 1]
+        bent = normal + (K_uu * x + K_uv * y)[:, None] * t_u + (K_uv * x + K_vv * y)[:, None] * t_v
         alpha = np.minimum(s["opacities"][:, 0] * np.exp(-0.5 * (u * u + v * v)), cut.alpha_max)
         spared = (cosine > 0) & ((t < thickness) if surfels.two_sided else True) & (leaves or not surfels.two_sided)
         remaining = 1.0
@@ -39,7 +42,7 @@ def brute_force(surfels, origin, direction, reach, leaves):
             if 0 < t[i] < reach and alpha[i] > cut.alpha_min and not spared[i] and remaining > cut.transmittance_min:
                 weights[r, i] = w = remaining * alpha[i]
                 remaining -= w
-        facing = np.where((cosine > 0)[:, None], -normal, normal) + s["delta_normal"]
+        facing = np.where((cosine > 0)[:, None], -bent, bent) + s["delta_normal"]
         coverage[r], mean[r], t_mean[r] = 1 - remaining, weights[r] @ facing, weights[r] @ np.where(weights[r] > 0, t, 0)
         rough[r] = weights[r] @ s["roughness"]
     some = np.maximum(coverage, 1e-9)

@@ -23,6 +23,7 @@ def surfels(n=40, degree=3, seed=0):
         "roughness": rng.uniform(size=(n, 1)),
         "metallic": rng.uniform(size=(n, 1)),
         "delta_normal": rng.normal(size=(n, 3)),
+        "curvature": rng.normal(size=(n, 3)),
     }
     return {name: value.astype(np.float32) for name, value in fields.items()}
 
@@ -99,13 +100,14 @@ def test_plain_2dgs(ply, tmp_path):
         for i in range(4):
             data[f"rot_{i}"] *= 3
 
-    extra = ("base_color", "roughness", "metallic", "delta_normal", "scale_2", "n")
+    extra = ("base_color", "roughness", "metallic", "delta_normal", "curvature", "scale_2", "n")
     rewrite(ply, str(tmp_path / "2dgs.ply"), keep=lambda name: not name.startswith(extra), change=change)
     fields = read_ply(tmp_path / "2dgs.ply")
     np.testing.assert_allclose(fields["rotations"], surfels()["rotations"], atol=1e-6)
     assert ((fields["opacities"] > 0) & (fields["opacities"] < 1)).all()
     assert (fields["base_color"] == 0.5).all() and (fields["roughness"] == 0.5).all()
     assert not fields["metallic"].any() and not fields["delta_normal"].any()
+    assert not fields["curvature"].any()
 
 
 def test_extreme_values_stay_finite(tmp_path):

@@ -10,7 +10,7 @@ import pytest
 from rgs_mi.splat import gbuffer
 from rgs_mi.splat.reference import render_gbuffer_reference
 from rgs_mi.splat.tiles import Cutoffs
-from rgs_mi.surfel import CHANNELS, Surfels
+from rgs_mi.surfel import CHANNELS, Surfels, rotation_from_normal
 
 from scenes import layered_surfels, orbit_camera, sphere_surfels
 
@@ -20,7 +20,7 @@ SMOOTH = Cutoffs(alpha_min=1e-7, alpha_max=0.9999, transmittance_min=0, window=9
 
 
 def render_gbuffer(surfels, camera, cutoffs=Cutoffs()):
-    return gbuffer.render_gbuffer(surfels, camera, cutoffs=cutoffs, squares=True).all
+    return gbuffer.render_gbuffer(surfels, camera, cutoffs=cutoffs, full=True).all
 
 
 def stacked(maps):
@@ -81,6 +81,31 @@ def test_window_brings_tiles_into_order():
 
     seams = {window: np.square(image(0, window) - image(4, window)).mean() for window in (1, 16)}
     assert 0 < seams[16] < 0.1 * seams[1], seams
+
+
+def test_curved_surfels_have_the_normals_of_a_sphere():
+    """Surfels that touch a unit sphere: with its curvature they show its normals many times as well as without."""
+    camera, n = orbit_camera(size=(96, 96)), 400
+    scale = 0.6 * np.sqrt(4 * np.pi / n)
+    centers = sphere_surfels(n).numpy()["centers"]
+    flat = sphere_surfels(n).numpy() | {
+        "rotations": rotation_from_normal(centers), "delta_normal": np.zeros((n, 3)), "curvature": np.zeros((n, 3)),
+        "scales": np.full((n, 2), scale), "opacities": np.full((n, 1), 0.8)}
+    directions = camera.rays().reshape(-1, 3)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    closest = -directions @ camera.origin
+    inside = 1 - ((camera.origin + closest[:, None] * directions)**2).sum(1)
+    seen = inside > 0.2  # away from the silhouette
+    true = camera.origin + (closest - np.sqrt(np.maximum(inside, 0)))[:, None] * directions
+
+    def degrees(curvature):
+        surfels = Surfels.from_numpy(flat | {"curvature": np.tile(scale * np.array(curvature), (n, 1))}, two_sided=False)
+        normal = render_gbuffer(surfels, camera).normal.numpy().T
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
+        return np.degrees(np.arccos(np.clip((normal * true).sum(1)[seen], -1, 1))).mean()
+
+    assert 4 * degrees([1, 0, 1]) < degrees([0, 0, 0])
+    assert degrees([-1, 0, -1]) > degrees([0, 0, 0])  # the sign matters
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -158,8 +158,8 @@ def _reflected(gbuffer, camera, lighting):
     return diffuse, specular
 
 
-def render(surfels, camera, lighting: Lighting | None, screen_offset=None, squares=False) -> Image:
+def render(surfels, camera, lighting: Lighting | None, screen_offset=None, full=False) -> Image:
     """Splat (see `render_gbuffer`) and `shade`; differentiable in the surfels' fields, the environment and the shader."""
     if lighting is not None:
         surfels = lighting.splatted(surfels)
-    return shade(render_gbuffer(surfels, camera, screen_offset, squares=squares), camera, lighting)
+    return shade(render_gbuffer(surfels, camera, screen_offset, full=full), camera, lighting)

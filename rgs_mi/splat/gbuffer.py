@@ -17,10 +17,10 @@ class Maps:
     """Accumulated attributes, a lane a pixel; each is Σ w · attribute, so divide by ``alpha`` for means.
 
       diffuse        Σ w c, linear radiance                 ``mi.Color3f``
-      normal         Σ w (n + Δn), world space              ``mi.Vector3f``
-      delta_normal   Σ w Δn                                 ``mi.Vector3f``
+      normal         Σ w (n(u, v) + Δn), world space        ``mi.Vector3f``
       base_color, roughness, metallic, depth (z), alpha = Σ w
-      square                                                depth², where `render_gbuffer` was asked for it, else None
+      delta_normal   Σ w Δn                                 ``mi.Vector3f``
+      square         Σ w z²; this and delta_normal where `render_gbuffer` was asked for all maps, else None
     """
 
     diffuse: "mi.Color3f"
@@ -28,9 +28,9 @@ class Maps:
     base_color: "mi.Color3f"
     roughness: "mi.Float"
     metallic: "mi.Float"
-    delta_normal: "mi.Vector3f"
     depth: "mi.Float"
     alpha: "mi.Float"
+    delta_normal: "mi.Vector3f | None" = None
     square: "mi.Float | None" = None
 
 
@@ -42,7 +42,7 @@ class GBuffer:
     size: tuple[int, int]
     image: "mi.Float"
     seen: "mi.Bool"
-    squares: bool = False
+    full: bool = False
 
     @functools.cached_property
     def all(self) -> Maps:
@@ -51,20 +51,21 @@ class GBuffer:
 
     def maps(self, index) -> Maps:
         """The maps at pixels number ``index``."""
-        packets = 5 if self.squares else 4
+        packets = 5 if self.full else 4
         m = [v for q in range(packets) for v in dr.gather(mi.Vector4f, self.image, index * packets + q)]
-        return Maps(mi.Color3f(*m[0:3]), mi.Vector3f(*m[3:6]), mi.Color3f(*m[6:9]), m[9], m[10], mi.Vector3f(*m[11:14]),
-                    m[14], m[15], m[16] if self.squares else None)
+        delta, m[11:] = (mi.Vector3f(*m[11:14]), m[14:]) if self.full else (None, m[11:])
+        return Maps(mi.Color3f(*m[0:3]), mi.Vector3f(*m[3:6]), mi.Color3f(*m[6:9]), m[9], m[10], m[11], m[12], delta,
+                    m[13] if self.full else None)
 
 
-def render_gbuffer(surfels, camera, screen_offset=None, cutoffs=Cutoffs(), squares=False) -> GBuffer:
-    """Splat ``surfels`` into ``camera``; differentiable in all fields. ``screen_offset``: see `project`. ``squares``: make
-    `Maps.square` as well."""
+def render_gbuffer(surfels, camera, screen_offset=None, cutoffs=Cutoffs(), full=False) -> GBuffer:
+    """Splat ``surfels`` into ``camera``; differentiable in all fields. ``screen_offset``: see `project`. ``full``: make the
+    maps that only regularisers want, too."""
     projected = project(surfels, camera, screen_offset)
     delta = surfels.column(mi.Vector3f, "delta_normal")
     features = [*surfels.radiance(projected.view), *(projected.normal + delta), *surfels.column(mi.Color3f, "base_color"),
-                surfels.column(mi.Float, "roughness"), surfels.column(mi.Float, "metallic"), *delta]
-    dr.eval(projected.geometry, features)
+                surfels.column(mi.Float, "roughness"), surfels.column(mi.Float, "metallic"), *(delta if full else ())]
+    dr.eval(projected.geometry, features, projected.slopes)
     lists = lane_lists(projected, camera.size, cutoffs)
-    image = composite(projected, features, lists, Layout(camera.size, len(features), cutoffs, squares))
-    return GBuffer(camera.size, image, lists.seen, squares)
+    image = composite(projected, features, lists, Layout(camera.size, len(features), cutoffs, squares=full))
+    return GBuffer(camera.size, image, lists.seen, full)

@@ -61,6 +61,7 @@ class Hit:
         on_plane = dr.select(in_front, self.u * self.u + self.v * self.v, dr.largest(mi.Float))
         on_screen = LOW_PASS * (self.dx * self.dx + self.dy * self.dy)
         self.on_plane = on_plane <= on_screen  # else the low-pass decides, and the depth is the centre's
+        self.offset = [dr.select(self.on_plane, value, 0) for value in (self.u, self.v)]  # where normals are taken
         self.gauss = dr.exp(-0.5 * dr.minimum(on_plane, on_screen))
         alpha = opacity * self.gauss
         self.kept = alpha > cutoffs.alpha_min
@@ -81,13 +82,14 @@ class Hit:
         nearest = dr.maximum(dr.minimum(on_plane, on_screen), 0)
         return dr.select(opacity * dr.exp(-0.5 * nearest * nearest) > cutoffs.alpha_min, self.t, -dr.inf)
 
-    def pull_back(self, record, d_alpha, d_t):
-        """Gradient of the ten geometric numbers, from that of α and t."""
+    def pull_back(self, record, d_alpha, d_t, d_offset):
+        """Gradient of the ten geometric numbers, from that of α, t and the offset."""
         _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, _ = record[:len(GEOMETRY)]
         d_alpha = dr.select(self.kept & ~self.clamped, d_alpha, 0)
         d_rho = -0.5 * self.alpha * d_alpha
         plane = lambda value: dr.select(self.on_plane, value, 0)
-        d_u, d_v = plane(2 * self.u * d_rho * self.inv_h), plane(2 * self.v * d_rho * self.inv_h)  # both over h
+        d_u, d_v = (plane((2 * value * d_rho + d_value) * self.inv_h)  # both over h
+                    for value, d_value in zip((self.u, self.v), d_offset))
         d_h = -(d_u * self.u + d_v * self.v) - plane(d_t * self.t * self.inv_h)
         d_screen = dr.select(self.on_plane, 0, 2 * LOW_PASS * d_rho)
         d_dx = d_u * A_x + d_v * B_x + d_h * N_x + d_screen * self.dx
@@ -96,7 +98,7 @@ class Hit:
                 dr.select(self.on_plane, d_t * self.inv_h, d_t), d_alpha * self.gauss]
 
     def push_forward(self, record, tangent):
-        """(α̇, ṫ) from the tangent of the record."""
+        """The tangents of α, t and the offset, from that of the record."""
         _, _, A_x, A_y, B_x, B_y, N_x, N_y, z, _ = record[:len(GEOMETRY)]
         X_, Y_, A_x_, A_y_, B_x_, B_y_, N_x_, N_y_, z_, opacity_ = tangent[:len(GEOMETRY)]
         h_ = N_x_ * self.dx + N_y_ * self.dy - N_x * X_ - N_y * Y_
@@ -104,4 +106,5 @@ class Hit:
         v_ = (B_x_ * self.dx + B_y_ * self.dy - B_x * X_ - B_y * Y_ - self.v * h_) * self.inv_h
         rho_ = dr.select(self.on_plane, 2 * (self.u * u_ + self.v * v_), -2 * LOW_PASS * (self.dx * X_ + self.dy * Y_))
         alpha_ = dr.select(self.kept & ~self.clamped, opacity_ * self.gauss - 0.5 * self.alpha * rho_, 0)
-        return alpha_, dr.select(self.on_plane, (z_ - self.t * h_) * self.inv_h, z_)
+        on_plane = lambda value, otherwise=0: dr.select(self.on_plane, value, otherwise)
+        return alpha_, on_plane((z_ - self.t * h_) * self.inv_h, z_), [on_plane(u_), on_plane(v_)]

@@ -24,12 +24,13 @@ EDGE_ON = 1e-3  # least |cosine| between a surfel's normal and the ray to its ce
 @dataclass
 class Projected:
     """``geometry``: the ten numbers of (1), ``mi.Float`` of width N each; ``view``: unit directions from the camera to the
-    centres, world space; ``normal``: unit normals turned towards the camera, world space; ``visible``: in front of it,
-    and turned to it where surfels are one-sided."""
+    centres, world space; ``normal``: unit normals turned towards the camera, world space, and ``slopes``: how they change
+    with u and v; ``visible``: in front of the camera, and turned to it where surfels are one-sided."""
 
     geometry: list
     view: "mi.Vector3f"
     normal: "mi.Vector3f"
+    slopes: tuple
     visible: "mi.Bool"
 
 
@@ -73,5 +74,6 @@ def project(surfels, camera, screen_offset=None) -> Projected:
     A = mi.Vector2f(a.x / f.x, a.y / f.y) * z - dr.dot(p, a) * N
     B = mi.Vector2f(b.x / f.x, b.y / f.y) * z - dr.dot(p, b) * N
     opacity = surfels.column(mi.Float, "opacities")
+    turned = lambda v: dr.select(facing > 0, -v, v)
     return Projected([x, y, A.x, A.y, B.x, B.y, N.x, N.y, z, opacity],
-                     offset / distance, dr.select(facing > 0, -n_world, n_world), visible)
+                     offset / distance, turned(n_world), tuple(map(turned, surfels.slopes())), visible)

@@ -74,7 +74,9 @@ def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> Maps:
         dr.scatter(weight, w, at)
         T = T - w
 
-    delta = of(mi.Vector3f, "delta_normal")
+    K, delta = of(mi.Vector3f, "curvature") / dr.sqrt(scales.x * scales.y), of(mi.Vector3f, "delta_normal")
+    across, along = dr.select(on_plane <= on_screen, u * scales.x, 0), dr.select(on_plane <= on_screen, v * scales.y, 0)
+    normal += (K.x * across + K.y * along) * t_u + (K.y * across + K.z * along) * t_v
     radiance = dr.gather(mi.Color3f, surfels.radiance(dr.normalize(centers - origin)), surfel)
     z = dr.select(on_plane <= on_screen, t, z)
     columns = lambda kind, value: [value] if kind is mi.Float else value
