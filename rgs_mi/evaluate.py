@@ -1,12 +1,15 @@
 """How good a fit is: held-out views rendered, compared with their photographs, and timed."""
 
+import math
 import time
 from dataclasses import dataclass
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from . import losses, lpips, metrics
+from .aligned import lanes
 from .color import display
 from .shading import deferred
 
@@ -29,20 +32,28 @@ class Rendering:
     maps: dict[str, np.ndarray]
 
 
-def render_view(surfels, lighting, camera, background) -> Rendering:
-    """Render ``surfels`` under a `Lighting` (None: diffuse only) over the display-space grey level ``background``."""
-    width, height = camera.size
-    array = lambda v: np.atleast_2d(dr.detach(v).numpy()).T.reshape(height, width, -1)
+def render_view(surfels, lighting, camera, background, spp=1) -> Rendering:
+    """Render ``surfels`` under a `Lighting` (None: diffuse only) over the display-space grey level ``background``, with
+    ``spp`` samples per pixel, rounded up to a square: linear radiance and all maps are means over a grid, as those of
+    'rgs_deferred'."""
+    (width, height), side = camera.size, math.ceil(math.sqrt(spp))
     with dr.suspend_grad():
-        image = deferred.render(surfels, camera, lighting)
+        image = deferred.render(surfels, camera.resized(side * width, side * height), lighting)
         m = image.gbuffer.all
         length = dr.norm(m.normal)
         normal = dr.select(length > 0, m.normal * (m.alpha / length), 0)
-        shown = losses.display(image.color, m.alpha, background)
         maps = {"color": image.color, "diffuse": image.diffuse, "specular": image.specular, "normal": normal,
-                "base_color": m.base_color, "roughness": m.roughness, "metallic": m.metallic, "depth": m.depth}
-        dr.eval(shown, m.alpha, maps)
-    return Rendering(np.clip(array(shown), 0, 1), array(m.alpha), {k: array(v) for k, v in maps.items()})
+                "base_color": m.base_color, "roughness": m.roughness, "metallic": m.metallic, "depth": m.depth,
+                "alpha": m.alpha}
+        dr.eval(maps)
+        samples = {k: np.atleast_2d(v.numpy()).T.reshape(height, side, width, side, -1) for k, v in maps.items()}
+        means = {k: v.mean((1, 3)) for k, v in samples.items()}
+        alpha = means.pop("alpha")
+        length = np.linalg.norm(means["normal"], axis=-1, keepdims=True)
+        means["normal"] *= alpha / np.where(length > 0, length, 1)
+        color = mi.Color3f(*(lanes(means["color"][..., k]) for k in range(3)))
+        shown = losses.display(color, lanes(alpha), background).numpy().T.reshape(height, width, 3)
+    return Rendering(np.clip(shown, 0, 1), alpha, means)
 
 
 def photograph(view, background) -> np.ndarray:
@@ -87,9 +98,11 @@ def _finite(value):
     return value if np.isfinite(value) else None
 
 
-def frames_per_second(surfels, lighting, cameras, frames=20) -> float:
-    """Views per second, G-buffer and shading, kernels compiled and the environment filtered beforehand: the median."""
-    seconds = []
+def frames_per_second(surfels, lighting, cameras, spp=1, frames=20) -> float:
+    """Views per second with ``spp`` samples per pixel, G-buffer and shading, kernels compiled and the environment filtered
+    beforehand: the median."""
+    seconds, side = [], math.ceil(math.sqrt(spp))
+    cameras = [camera.resized(*(side * n for n in camera.size)) for camera in cameras]
     with dr.suspend_grad():
         for k in range(frames + 1):
             dr.sync_thread()

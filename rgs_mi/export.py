@@ -25,13 +25,13 @@ def write_exr(path, pixels: np.ndarray, channels=None):
         stream.write(memory.raw_buffer())
 
 
-def export(folder, scene, surfels, environment, shading, indirect, shader, views) -> list[Path]:
+def export(folder, scene, surfels, environment, shading, indirect, shader, views, spp=1) -> list[Path]:
     """Write ``object.ply``, ``environment.exr``, ``shader.npz`` (where ``shader`` is not None, the identity) and
     ``scene.xml`` into ``folder`` and return their paths.
 
     The scene is the one that was fitted (a `FitScene`) with the results in place of where the fit started, its
-    ``shading``, ``indirect`` light, and a sensor for each of ``views``, whose id is the view's name:
-    ``mi.render(mi.load_file("scene.xml"), sensor=i)``.
+    ``shading``, ``indirect`` light, and a sensor of ``spp`` samples per pixel for each of ``views``, whose id is the view's
+    name: ``mi.render(mi.load_file("scene.xml"), sensor=i)``.
     Raises: UserError where the disk is full or the folder can't be written.
     """
     folder = Path(folder)
@@ -44,7 +44,7 @@ def export(folder, scene, surfels, environment, shading, indirect, shader, views
                                                  "box": shading.box})
     if any(abs(v.camera.focal[0] / v.camera.focal[1] - 1) > 1e-4 for v in views):
         warnings.warn(f"{folder / SCENE}: the cameras' pixels are not square, those of its sensors are", stacklevel=2)
-    root.extend(_sensor(view) for view in views)
+    root.extend(_sensor(view, spp) for view in views)
     ET.indent(root, "    ")
     with atomic_file(folder / SCENE) as stream:
         ET.ElementTree(root).write(stream, encoding="utf-8", xml_declaration=True)
@@ -83,7 +83,7 @@ def _fitted(scene, surfels, environment, properties):
     return root
 
 
-def _sensor(view):
+def _sensor(view, spp):
     d = view.camera.to_sensor_dict()
     sensor = ET.Element("sensor", type="perspective", id=sensor_id(view.name))
     numbers = ("fov", "principal_point_offset_x", "principal_point_offset_y")
@@ -91,7 +91,7 @@ def _sensor(view):
     film.extend([_element("integer", "width", d["film"]["width"]), _element("integer", "height", d["film"]["height"]),
                  _element("string", "pixel_format", "rgba"), ET.Element("rfilter", type="box")])
     sampler = ET.Element("sampler", type="independent")
-    sampler.append(_element("integer", "sample_count", 1))
+    sampler.append(_element("integer", "sample_count", spp))
     sensor.extend([_transform(np.array(d["to_world"].matrix)), _element("string", "fov_axis", "x"),
                    *(_element("float", name, f"{d[name]:.9g}") for name in numbers), film, sampler])
     return sensor

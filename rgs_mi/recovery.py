@@ -75,7 +75,8 @@ def _views(truth, variables, size, quiet):
 
 def _render(scene, view, integrator=None):
     sensor = mi.load_dict(sensor_dict(view.camera))
-    return np.array(mi.render(scene, sensor=sensor, integrator=integrator or scene.integrator(), spp=1))
+    return np.array(mi.render(scene, sensor=sensor, integrator=integrator or scene.integrator(),
+                              spp=scene.sensors()[0].sampler().sample_count()))
 
 
 def _compare(scene, views, picture):

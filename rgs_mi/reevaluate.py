@@ -43,7 +43,8 @@ def reevaluate(run, data=None, quiet=False) -> dict:
     scene = load_scene(path, {})
     surfels, lighting = lit_surfels(scene, path)
     dataset = _photographs(data or saved.get("photographs"), scene, run)
-    mean, scores, rows = results.measure(surfels, lighting, dataset, _background(saved, run), run, quiet)
+    background, spp = _background(saved, run), scene.sensors()[0].sampler().sample_count()
+    mean, scores, rows = results.measure(surfels, lighting, dataset, background, spp, run, quiet)
     if not lpips.installed():
         _keep_lpips(saved, mean, scores)
     now = {"photographs": str(dataset.root.resolve()), "evaluated": results.circumstances()}

@@ -26,8 +26,8 @@ _MOST = 10_000  # frames
 AOVS = ("albedo", "roughness", "metallic", "normal", "depth", "diffuse", "specular", "alpha")
 
 
-def render_scene(path, *, variables=None, view=None, turntable=None, along=None, filmed=False, size=None, spp=1, out=None,
-                 aovs=False, envmap=None, rotate=0.0, changes=(), quiet=False) -> list[Path]:
+def render_scene(path, *, variables=None, view=None, turntable=None, along=None, filmed=False, size=None, spp=None,
+                 out=None, aovs=False, envmap=None, rotate=0.0, changes=(), quiet=False) -> list[Path]:
     """Render a scene of surfels into PNGs with straight alpha, and return their paths.
 
     Args:
@@ -40,7 +40,7 @@ def render_scene(path, *, variables=None, view=None, turntable=None, along=None,
                  a run is that of its test views (0: the sensors themselves)
       filmed:    whether to write the frames as a video and a contact sheet, too (`video.write`)
       size:      width in pixels (default: the sensor's); the height follows
-      spp:       samples per pixel; a square number for 'rgs_deferred'
+      spp:       samples per pixel; a square number for 'rgs_deferred' (default: what the first sensor says)
       out:       a folder, or a PNG for a single view (default: ``renders``, ``turntable`` or ``path`` beside the scene)
       aovs:      whether to write ``NAME.exr`` as well: radiance, alpha and the G-buffer, float32
       envmap, rotate: another light, and the degrees by which light is turned (`relight`)
@@ -72,6 +72,7 @@ def render_scene(path, *, variables=None, view=None, turntable=None, along=None,
         _view(scene, path, view)
     out = Path(out) if out else path.parent / ("turntable" if turntable else "path" if moves else "renders")
     integrator = with_aovs(scene, path) if aovs else scene.integrator()
+    spp = spp or scene.sensors()[0].sampler().sample_count()
     written = []
     with Progress(None, quiet or len(cameras) == 1 and spp <= _PASS, "rendering") as progress:
         for k, (name, camera) in enumerate(cameras.items()):

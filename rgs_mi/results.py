@@ -31,16 +31,16 @@ def write(fit, scene, folder, quiet):
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
         exported = export(folder, scene, surfels, environment, *fit.begun, fit.model.shader(),
-                          judged(fit.dataset))
+                          judged(fit.dataset), fit.settings.spp)
         lighting = fit.lighting(surfels)
-    mean, scores, rows = measure(surfels, lighting, fit.dataset, fit.settings.background, folder, quiet)
+    mean, scores, rows = measure(surfels, lighting, fit.dataset, fit.settings.background, fit.settings.spp, folder, quiet)
     if (guided := fit.guided_picture()) is not None:
         pictures.write_png(folder / GUIDED, guided / 255)
     fit.curves.write(folder)
     publish(folder, mean | facts | {"views": scores}, fit.curves, rows, environment, exported)
 
 
-def measure(surfels, lighting, dataset, background, folder, quiet) -> tuple[dict, dict, dict]:
+def measure(surfels, lighting, dataset, background, spp, folder, quiet) -> tuple[dict, dict, dict]:
     """Render the views of a `Dataset` that results are of, and write their pictures below ``folder``.
 
     Args: see `evaluate.render_view`. Returns: the figures of quality and speed, means as metrics.json has them; its
@@ -50,7 +50,7 @@ def measure(surfels, lighting, dataset, background, folder, quiet) -> tuple[dict
     on_sheet = {view.name for view in shown(views)}
     with Progress(None, quiet, "evaluating") as progress:
         for k, view in enumerate(views):
-            rendering = evaluate.render_view(surfels, lighting, view.camera, background)
+            rendering = evaluate.render_view(surfels, lighting, view.camera, background, spp)
             pictures.write_view(folder / "test", view, rendering, background, gbuffer=view.name in on_sheet)
             scores[view.name] = evaluate.score(view, rendering, background)
             if view.name in on_sheet:
@@ -61,7 +61,7 @@ def measure(surfels, lighting, dataset, background, folder, quiet) -> tuple[dict
     mean = evaluate.mean_scores(list(scores.values()))
     reason = None if mean["lpips"] is not None else \
         "not measured: no test views that are large enough" if lpips.installed() else _NO_LPIPS
-    fps = evaluate.frames_per_second(surfels, lighting, [view.camera for view in views])
+    fps = evaluate.frames_per_second(surfels, lighting, [view.camera for view in views], spp)
     return mean | {"lpips_reason": reason, "render_fps": fps}, scores, rows
 
 

@@ -96,6 +96,7 @@ class Settings:
     minutes: float | None = _within(8.0, 0.01, 100_000)
     iterations: int | None = _within(None, 1, 10_000_000)
     seed: int = _within(0, 0, 2**31)
+    spp: int = _within(4, 1, 64)  # samples per pixel of what a fit leaves behind, on a grid; its steps take one
     background: float = _within(1.0, 0, 1)  # display grey level behind masked objects, in training and in figures
     specular_start: float = _within(0.0, 0, 1)  # fraction of the fit from which reflections are shaded; 1: never
     # Lower and upper corner of the box around the object, in captures without masks: what reflects. Unless given, it is

@@ -22,8 +22,8 @@ def main():
     parser.add_argument("--video", action="store_true", help="make the frames a video, too, and a contact sheet; needs "
                         "`pip install imageio-ffmpeg`")
     parser.add_argument("--size", type=int, metavar="W", help="width in pixels (default: the sensor's)")
-    parser.add_argument("--spp", type=int, default=1, help="samples per pixel; for surfels alone a square number "
-                        "(default: %(default)s)")
+    parser.add_argument("--spp", type=int, help="samples per pixel; for surfels alone a square number (default: as the "
+                        "scene says)")
     parser.add_argument("--out", type=Path, metavar="FILE_OR_DIR", help="where to (default: a folder beside the scene)")
     parser.add_argument("--aovs", action="store_true", help="write the G-buffer as well, a multichannel EXR")
     parser.add_argument("--envmap", metavar="FILE", help="light it by this image, latitude-longitude EXR or HDR, or by an "

@@ -76,6 +76,17 @@ def test_whatever_the_shading(inputs, tmp_path, overrides, options):
     assert_same(reevaluate.reevaluate(folder, quiet=True), before)
 
 
+def test_samples_per_pixel_are_those_of_the_scene(copy):
+    before, scene = metrics(copy), copy / "scene.xml"
+    assert before["settings"]["spp"] == 4
+    assert scene.read_text().count('name="sample_count" value="4"') == before["test_views"]
+    scene.write_text(scene.read_text().replace('name="sample_count" value="4"', 'name="sample_count" value="1"'))
+    again = reevaluate.reevaluate(copy, quiet=True)
+    assert again["psnr"] != pytest.approx(before["psnr"], abs=1e-3)
+    assert again["psnr"] == pytest.approx(before["psnr"], abs=1)
+
+
+
 def test_the_scene_is_what_is_judged(copy):
     """Not the checkpoints, which may be gone: another environment shows."""
     before = metrics(copy)
