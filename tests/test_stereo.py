@@ -112,6 +112,18 @@ def test_a_mirror_stays():
     assert left > 0.99
 
 
+def test_views_that_agree_by_chance_do_not_count():
+    """A tenth of the points of one heap, and all of another's: only the latter's surroundings agree with them."""
+    rng, step = np.random.default_rng(0), 0.01
+    heaps = np.array([0, 1]).repeat(2000)
+    points = rng.normal(size=(4000, 3)) * 5 * step + 80 * step * heaps[:, None]
+    agreed = np.where(heaps | (rng.random(4000) < 0.1), 0.8, 0.1)
+    around = stereo._mean_around(points, agreed, step)
+    assert around[heaps == 0].max() < stereo._AROUND < around[heaps == 1].min()
+    near = np.exp(-0.5 * ((points[:50, None] - points) ** 2).sum(-1) / (stereo._SURROUNDINGS * step) ** 2)
+    assert around[:50] == pytest.approx((near * agreed).sum(1) / near.sum(1), abs=0.02)
+
+
 def test_alikeness_is_what_loops_say():
     """Every correlation of a few pixels, window by window, in NumPy."""
     every = textured_tray()

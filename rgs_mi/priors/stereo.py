@@ -3,7 +3,8 @@
     1. `sweep`   Each view asks, pixel by pixel, how deep below the hull its surroundings look alike in the views next to it:
                  normalised cross-correlation over a window, the mean of the best few (Collins 1996, Goesele et al. 2006).
     2. `_agreed` A mirror image is alike somewhere below the hull, too, but elsewhere for other views. A point counts where
-                 most of the views that find something in its direction find it there.
+                 most of the views that find something in its direction find it there, and its surroundings do as well: on
+                 flat mirrors, views agree by chance here and there.
     3. `carve`   Grid nodes that several views look through are carved off the hull's field.
 
 So a cup gets its inside, and a ball of chrome stays one. Nothing here needs a network.
@@ -28,6 +29,8 @@ _ALIKE, _GAIN = 0.75, 0.15  # correlation that is enough, and how much above the
 _ABOVE = 2  # levels that count as the hull itself
 _SAME = 1.5  # levels between two views' depths that are the same
 _AGREED, _VIEWS = 0.4, 3  # part and number of views that must find the same
+_AROUND, _SURROUNDINGS = 0.45, 10  # their part in the mean over the surroundings: standard deviation of these, in levels
+_CELL = 2  # levels across a cell, of which that mean is made
 _SEEN_THROUGH = 3  # views that look through what is carved
 _FLAT = 1e-4  # variance of grey levels in a window that shows nothing
 
@@ -196,10 +199,24 @@ def _agreed(small, depths, deeper, step):
         z, (at, below_at) = _look(s.camera, points, depth, below)
         found += below_at > 0
         agree += (below_at > 0) & (abs(z - at - below_at) < _SAME * step)
-    kept = (agree > _VIEWS) & (agree > _AGREED * found)  # its own view is one of them
+    agreed = agree / np.maximum(found, 1)  # its own view is one of them
+    kept = (agree > _VIEWS) & (agreed > _AGREED) & (_mean_around(points, agreed, step) > _AROUND)
     for below, where, part in zip(deeper, sure, np.split(kept, np.cumsum([w.sum() for w in sure])[:-1])):
         below[where] *= part
     return deeper
+
+
+def _mean_around(points, values, step):
+    """[N] mean of ``values`` [N] over the surroundings of ``points`` [N, 3]."""
+    if not len(points):
+        return values
+    cell = np.floor((points - points.min(0)) / (_CELL * step)).astype(np.intp)
+    shape = cell.max(0) + 1
+    total, count = np.zeros((2, *shape))
+    np.add.at(total, tuple(cell.T), values)
+    np.add.at(count, tuple(cell.T), 1)
+    blurred = lambda sums: ndimage.gaussian_filter(sums, _SURROUNDINGS / _CELL, mode="constant")[tuple(cell.T)]
+    return blurred(total) / blurred(count)
 
 
 def _look(camera, points, *maps):
