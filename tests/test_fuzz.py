@@ -80,7 +80,7 @@ def write_all(root: Path) -> list:
     surfels = {"centers": rng.normal(size=(5, 3)), "rotations": np.tile([0, 0, 0, 1.0], (5, 1)),
                "scales": np.full((5, 2), 0.1), "opacities": np.full((5, 1), 0.5), "sh": rng.normal(size=(5, 12)),
                "base_color": np.full((5, 3), 0.5), "roughness": np.full((5, 1), 0.3), "metallic": np.zeros((5, 1)),
-               "delta_normal": np.zeros((5, 3))}
+               "delta_normal": np.zeros((5, 3)), "curvature": np.zeros((5, 3))}
     write_ply(root / "surfels.ply", surfels)
 
     run = folder("run")

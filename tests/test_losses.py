@@ -74,7 +74,8 @@ def test_depth_normals_agree_on_a_smooth_surface():
     """A densely covered sphere: depth normals are its normals, whichever way the camera turns."""
     surfels = sphere_surfels(4000, scale=1.0, opacity_shift=3)
     arrays = surfels.numpy()
-    arrays["rotations"], arrays["delta_normal"] = rotation_from_normal(arrays["centers"]), 0 * arrays["delta_normal"]
+    arrays |= {"rotations": rotation_from_normal(arrays["centers"]), "delta_normal": 0 * arrays["delta_normal"],
+               "curvature": 0 * arrays["curvature"]}
     camera = orbit_camera(size=(96, 96))
     good = losses.depth_normal_consistency(render_gbuffer(Surfels.from_numpy(arrays, two_sided=False), camera), camera)[0]
     tilted = arrays | {"delta_normal": np.full((4000, 3), 0.7, np.float32)}
