@@ -86,7 +86,6 @@ def test_samples_per_pixel_are_those_of_the_scene(copy):
     assert again["psnr"] == pytest.approx(before["psnr"], abs=1)
 
 
-
 def test_the_scene_is_what_is_judged(copy):
     """Not the checkpoints, which may be gone: another environment shows."""
     before = metrics(copy)
