@@ -60,7 +60,6 @@ regular grid in each pixel, over which the pixel is averaged whatever the film's
 but ``monte_carlo``, whose samples ``seed`` decides.
 """
 
-import math
 from dataclasses import replace
 
 import drjit as dr
@@ -113,9 +112,9 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         if mi.has_flag(film.flags(), mi.FilmFlags.Special):
             raise UserError(f"rgs_deferred: film '{film.id()}' is a {film.class_name()}: use an 'hdrfilm'")
         film.prepare(self.aov_names())
-        samples = math.ceil(math.sqrt(spp or sensor.sampler().sample_count()))
+        spp = spp or sensor.sampler().sample_count()
         has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-        channels = self._channels(scene, Camera.from_sensor(sensor), samples, has_alpha, seed)
+        channels = self._channels(scene, Camera.from_sensor(sensor), spp, has_alpha, seed)
         film.put_block(mi.ImageBlock(channels, film.crop_offset()))
         image = film.develop() if develop else mi.TensorXf()
         if evaluate:
@@ -138,10 +137,10 @@ class DeferredIntegrator(mi.SamplingIntegrator):
 
     # ---- One image ----
 
-    def _channels(self, scene, camera, samples, has_alpha, seed):
+    def _channels(self, scene, camera, spp, has_alpha, seed):
         """[height, width, channels] in the layout of the film's block: R, G, B, (alpha,) weight, AOVs."""
         width, height = camera.size
-        camera = camera.resized(width * samples, height * samples)
+        camera, samples = camera.subdivided(spp)
         surfels, eta = surfels_in(scene)
         environment = self.environment(scene)
         image = deferred.render(surfels, camera, self.lighting(scene, surfels, eta, environment, seed))

@@ -5,6 +5,7 @@ the viewing direction, so that depth is z and pixel = focal * (x/z, y/z) + princ
 (x left, y up, z forward) appears only in `from_sensor` and `to_sensor_dict`.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -60,6 +61,12 @@ class Camera:
         sx, sy = width / self.size[0], height / self.size[1]
         return replace(self, focal=(self.focal[0] * sx, self.focal[1] * sy),
                        principal=(self.principal[0] * sx, self.principal[1] * sy), size=(width, height))
+
+    def subdivided(self, spp: int) -> tuple["Camera", int]:
+        """The same camera with a pixel for each of ``spp`` samples of a pixel, rounded up to a square, and how many of them
+        lie along its side."""
+        side = math.ceil(math.sqrt(spp))
+        return self.resized(*(side * n for n in self.size)), side
 
     def cropped(self, x: int, y: int, width: int, height: int) -> "Camera":
         """The same camera, restricted to the window of ``width`` × ``height`` pixels whose corner is pixel (x, y)."""

@@ -1,6 +1,5 @@
 """How good a fit is: held-out views rendered, compared with their photographs, and timed."""
 
-import math
 import time
 from dataclasses import dataclass
 
@@ -36,9 +35,9 @@ def render_view(surfels, lighting, camera, background, spp=1) -> Rendering:
     """Render ``surfels`` under a `Lighting` (None: diffuse only) over the display-space grey level ``background``, with
     ``spp`` samples per pixel, rounded up to a square: linear radiance and all maps are means over a grid, as those of
     'rgs_deferred'."""
-    (width, height), side = camera.size, math.ceil(math.sqrt(spp))
+    (width, height), (fine, side) = camera.size, camera.subdivided(spp)
     with dr.suspend_grad():
-        image = deferred.render(surfels, camera.resized(side * width, side * height), lighting)
+        image = deferred.render(surfels, fine, lighting)
         m = image.gbuffer.all
         length = dr.norm(m.normal)
         normal = dr.select(length > 0, m.normal * (m.alpha / length), 0)
@@ -101,8 +100,7 @@ def _finite(value):
 def frames_per_second(surfels, lighting, cameras, spp=1, frames=20) -> float:
     """Views per second with ``spp`` samples per pixel, G-buffer and shading, kernels compiled and the environment filtered
     beforehand: the median."""
-    seconds, side = [], math.ceil(math.sqrt(spp))
-    cameras = [camera.resized(*(side * n for n in camera.size)) for camera in cameras]
+    seconds, cameras = [], [camera.subdivided(spp)[0] for camera in cameras]
     with dr.suspend_grad():
         for k in range(frames + 1):
             dr.sync_thread()

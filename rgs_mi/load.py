@@ -35,6 +35,11 @@ def surfels_of(scene, path):
     return found[0]
 
 
+def spp_of(scene) -> int:
+    """Samples per pixel that the scene's first sensor asks for."""
+    return scene.sensors()[0].sampler().sample_count()
+
+
 def lit_surfels(scene, path):
     """The scene's `Surfels`, and the `Lighting` by which its integrator shades them (None: diffuse radiance alone).
 

@@ -23,7 +23,7 @@ from .aligned import lanes
 from .checkpoint import atomic_file
 from .evaluate import photograph
 from .export import SCENE
-from .load import load_scene, surfels_of
+from .load import load_scene, spp_of, surfels_of
 from .pictures import write_png
 from .relight import relight
 from .render import sensor_dict, straight, with_aovs
@@ -75,8 +75,7 @@ def _views(truth, variables, size, quiet):
 
 def _render(scene, view, integrator=None):
     sensor = mi.load_dict(sensor_dict(view.camera))
-    return np.array(mi.render(scene, sensor=sensor, integrator=integrator or scene.integrator(),
-                              spp=scene.sensors()[0].sampler().sample_count()))
+    return np.array(mi.render(scene, sensor=sensor, integrator=integrator or scene.integrator(), spp=spp_of(scene)))
 
 
 def _compare(scene, views, picture):

@@ -17,7 +17,7 @@ from .curves import Curves
 from .errors import UserError
 from .evaluate import SCORES
 from .export import SCENE, sensor_id
-from .load import lit_surfels, load_scene
+from .load import lit_surfels, load_scene, spp_of
 from .settings import Settings
 from .shading.environment import Environment
 from .views import load_dataset
@@ -43,8 +43,7 @@ def reevaluate(run, data=None, quiet=False) -> dict:
     scene = load_scene(path, {})
     surfels, lighting = lit_surfels(scene, path)
     dataset = _photographs(data or saved.get("photographs"), scene, run)
-    background, spp = _background(saved, run), scene.sensors()[0].sampler().sample_count()
-    mean, scores, rows = results.measure(surfels, lighting, dataset, background, spp, run, quiet)
+    mean, scores, rows = results.measure(surfels, lighting, dataset, _background(saved, run), spp_of(scene), run, quiet)
     if not lpips.installed():
         _keep_lpips(saved, mean, scores)
     now = {"photographs": str(dataset.root.resolve()), "evaluated": results.circumstances()}

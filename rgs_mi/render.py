@@ -14,7 +14,7 @@ from .camera import Camera
 from .color import srgb_encode
 from .errors import UserError
 from .export import SCENE, write_exr
-from .load import load_scene, surfels_of
+from .load import load_scene, spp_of, surfels_of
 from .pictures import write_png
 from .priors.hull import looked_at
 from .progress import Progress
@@ -72,7 +72,7 @@ def render_scene(path, *, variables=None, view=None, turntable=None, along=None,
         _view(scene, path, view)
     out = Path(out) if out else path.parent / ("turntable" if turntable else "path" if moves else "renders")
     integrator = with_aovs(scene, path) if aovs else scene.integrator()
-    spp = spp or scene.sensors()[0].sampler().sample_count()
+    spp = spp or spp_of(scene)
     written = []
     with Progress(None, quiet or len(cameras) == 1 and spp <= _PASS, "rendering") as progress:
         for k, (name, camera) in enumerate(cameras.items()):
