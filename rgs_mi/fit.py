@@ -27,6 +27,7 @@ _RATES = {"centers": "centers", "rotations": "rotations", "log_scales": "scales"
           "sh_dc": "sh_dc", "sh_rest": "sh_rest", "logit_base_color": "base_color", "logit_roughness": "roughness",
           "logit_metallic": "metallic", "delta_normal": "delta_normal", "curvature": "curvature",
           ENVIRONMENT: "environment", SHADER: "shader"}
+_NORMALS, _HELD = ("rotations", "delta_normal", "curvature"), 0.1  # the part of their rates that they have at first
 _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
 _DIVERGED = 10  # steps in a row without a finite error
 
@@ -277,6 +278,9 @@ class Fit:
         for name in self.model.optimizer.keys():
             rate[name] = self._scheduled(getattr(self.settings.rates, _RATES[name]))
         rate["centers"] *= self.extent
+        # A light that has no shape yet would turn normals that the hull has right. Two-sided surfels began at random.
+        if self.progress < self.settings.normals_start and not self.model.two_sided:
+            rate |= {name: _HELD * rate[name] for name in _NORMALS}
         self.model.optimizer.set_learning_rate(rate)
 
     def _control_density(self):

@@ -99,6 +99,8 @@ class Settings:
     spp: int = _within(4, 1, 64)  # samples per pixel of what a fit leaves behind, on a grid; its steps take one
     background: float = _within(1.0, 0, 1)  # display grey level behind masked objects, in training and in figures
     specular_start: float = _within(0.0, 0, 1)  # fraction of the fit from which reflections are shaded; 1: never
+    # Fraction of the fit from which the normals of a start on the hull move at their rates; before, at a tenth of them
+    normals_start: float = _within(0.2, 0, 1)
     # Lower and upper corner of the box around the object, in captures without masks: what reflects. Unless given, it is
     # half as far from the point that the cameras look at as the nearest of them
     box: tuple[float, float, float, float, float, float] | None = None

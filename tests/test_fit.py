@@ -256,6 +256,21 @@ def test_a_fit_that_is_stopped_is_shaded_by_what_has_begun(dataset):
     assert begun == [("none", "none"), ("split_sum", "none"), ("split_sum", "one_bounce"), ("monte_carlo", "one_bounce")]
 
 
+@pytest.mark.parametrize("two_sided, normals_start, part", [(False, 0.2, 0.1), (False, 0.0, 1), (True, 0.2, 1)])
+def test_normals_of_a_hull_wait_for_the_light(dataset, two_sided, normals_start, part):
+    """Adam's first step is as long as its rate, where there is a gradient. Random normals have nothing to wait with."""
+    learned = model()
+    learned.two_sided = two_sided
+    settings = replace(SETTINGS, normals_start=normals_start, sh_start=1.0)
+    fit, before = Fit(dataset, learned, settings, 1.0), {k: learned.numpy(k) for k in ("rotations", "centers")}
+    fit.step()
+    moved = {k: np.abs(learned.numpy(k) - value).max() for k, value in before.items()}
+    assert moved["rotations"] == pytest.approx(part * 2e-3, rel=0.01) and moved["centers"] == pytest.approx(5e-4, rel=0.01)
+    fit.step_number = 8  # of 40
+    fit._set_rates()
+    assert fit.model.optimizer.learning_rate("rotations") == pytest.approx(2e-3 * 0.1**0.2)
+
+
 @pytest.mark.parametrize("where, opacity", [("hull", 0.7), ("points", 0.7), ("anywhere", 0.1)])
 def test_opacities_to_start_with(dataset, where, opacity):
     points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)

@@ -112,6 +112,15 @@ def test_surface_is_not_stair_stepped(data):
     assert distance.std() < 0.25 * field.step
 
 
+@pytest.mark.parametrize("size, steps", [(96, 160), (640, 392), (1280, 400)])
+def test_a_step_is_a_pixel_within_bounds(size, steps):
+    """A box 1.12 wide, 2.5 away: 0.448 of a frame of 40 degrees is 0.6154 of its width."""
+    silhouettes = hull._silhouettes(views_of(around(size=size)[:3]))
+    half = np.array([0.3, 0.56, 0.5])
+    expected = np.clip(1.12 / 2.5 / (2 * np.tan(np.radians(20))) * size, 160, 400)
+    assert hull._pixels_across(silhouettes, CENTRE - half, CENTRE + half) == int(expected) == pytest.approx(steps, abs=2)
+
+
 def test_coarse_to_fine_skips_nothing(data):
     """The narrow band gives what carving every node does."""
     silhouettes = hull._silhouettes(data.train)
@@ -185,6 +194,20 @@ def test_samples_are_spread_evenly(mesh):
     assert nearest.mean() > 1.4 * random and np.percentile(nearest, 5) > random
     again, _ = hull.sample_surface(*mesh, 2000, np.random.default_rng(0))
     np.testing.assert_array_equal(positions, again)
+
+
+def test_samples_are_denser_where_a_mesh_bends():
+    x = np.linspace(-0.7, 0.7, 71)
+    q = np.abs(np.stack(np.meshgrid(x, x, x, indexing="ij"), -1)) - 0.5
+    cube = -(np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0))
+    mesh = hull.surface(hull.SignedField(cube.astype(np.float32), np.full(3, -0.7), 0.02))
+    positions, _ = hull.sample_surface(*mesh, 3000, np.random.default_rng(0))
+    second = np.sort(np.abs(positions), axis=1)[:, 1]  # 0.5 at an edge
+    strips = [(low < second) & (second < low + 0.02) for low in (0.2, 0.475)]
+    areas = [8 * (low + 0.02) ** 2 - 8 * low**2 for low in (0.2, 0.475)]  # of square frames, up to a factor
+    plain, bent = (strip.sum() / area for strip, area in zip(strips, areas))
+    assert 2.5 < bent / plain < 5, bent / plain
+    assert len(positions) == 3000
 
 
 def test_no_masks_and_no_common_volume(data):

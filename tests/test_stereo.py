@@ -112,6 +112,20 @@ def test_a_mirror_stays():
     assert left > 0.99
 
 
+def test_what_is_cut_off_a_fine_hull_is_what_the_rough_one_lost():
+    """A ball on a grid, a half-space on a coarser one that does not share its nodes: their intersection."""
+    def grid(lower, step, count, value):
+        x, y, z = lower + step * np.indices((count,) * 3)
+        return hull.SignedField(value(x, y, z).astype(np.float32), np.full(3, lower), step)
+
+    ball = grid(-0.6, 0.02, 61, lambda x, y, z: 0.5 - np.sqrt(x**2 + y**2 + z**2))
+    below = grid(-0.73, 0.05, 30, lambda x, y, z: 0.1 - z)
+    least = stereo._least(ball, below)
+    z = ball.lower[2] + ball.step * np.arange(61)
+    np.testing.assert_allclose(least.values, np.minimum(ball.values, 0.1 - z), atol=1e-6)
+    np.testing.assert_array_equal(least.lower, ball.lower)
+
+
 def test_views_that_agree_by_chance_do_not_count():
     """A tenth of the points of one heap, and all of another's: only the latter's surroundings agree with them."""
     rng, step = np.random.default_rng(0), 0.01

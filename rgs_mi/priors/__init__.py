@@ -22,15 +22,16 @@ from .maps import DepthPrior
 
 __all__ = ["NAMES", "DepthPrior", "depth_priors"]
 
-_VERSION = 1  # of everything that decides what is in the maps: a cached prior of another version is not read
+_VERSION = 2  # of everything that decides what is in the maps: a cached prior of another version is not read
 
 
-def _hull(views, resolution: int = 160) -> list[DepthPrior]:
-    """z-depths of the visual hull, ``resolution`` steps along its longest side; NaN beside it. Needs a JIT variant."""
+def _hull(views, resolution: int | None = None) -> list[DepthPrior]:
+    """z-depths of the visual hull, ``resolution`` steps along its longest side (None: as many as `hull.visual_hull` takes);
+    NaN beside it. Needs a JIT variant."""
     return _depths(hull.visual_hull(views, resolution), views)
 
 
-def _stereo(views, resolution: int = 160) -> list[DepthPrior]:
+def _stereo(views, resolution: int | None = None) -> list[DepthPrior]:
     """As `_hull`, of `stereo.carved_hull`."""
     return _depths(stereo.carved_hull(views, resolution), views)
 

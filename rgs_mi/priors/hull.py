@@ -18,6 +18,8 @@ _EDGE_SIGMA = 0.6  # pixels; small enough that lines one pixel wide stay above o
 _PIXEL_VARIANCE = 1 / 12  # of the box that an antialiased mask has been averaged over
 _FULL = 0.9  # a mask with more than this in a border pixel goes on beyond the frame
 _PAD = 2  # pixels of nothing around a mask that ends in its frame, as wide as the blur reaches
+_STEPS = 160, 400  # along the longest side, at least and at most, where a step would be a pixel
+_BEND, _DENSER = 0.3, 4  # difference of unit normals from sample to sample that is too much; how much denser samples may be
 
 
 @dataclass(frozen=True)
@@ -158,9 +160,12 @@ def looked_at(cameras) -> tuple[np.ndarray, float]:
 
 def _grid(lower, upper, step) -> tuple[np.ndarray, tuple[int, ...]]:
     """Nodes [N, 3] float32 of the smallest grid from ``lower`` on that covers the box, and its shape."""
-    shape = tuple(int(np.ceil(d / step)) + 1 for d in upper - lower)
-    axes = [lower[k] + step * np.arange(shape[k]) for k in range(3)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3).astype(np.float32), shape
+    shape = _shape(lower, upper, step)
+    return (lower + step * np.stack(np.unravel_index(np.arange(np.prod(shape)), shape), -1)).astype(np.float32), shape
+
+
+def _shape(lower, upper, step) -> tuple[int, ...]:
+    return tuple(int(np.ceil(d / step)) + 1 for d in upper - lower)
 
 
 def object_box(views) -> tuple[np.ndarray, np.ndarray]:
@@ -201,10 +206,19 @@ def carve(views, box, resolution: int = 160) -> SignedField:
     return _field(_silhouettes(views), box, resolution)
 
 
-def visual_hull(views, resolution: int = 160) -> SignedField:
-    """`carve` inside `object_box`, measuring the silhouettes once."""
+def visual_hull(views, resolution: int | None = None) -> SignedField:
+    """`carve` inside `object_box`, measuring the silhouettes once. Unless ``resolution`` is given, a step is as long as the
+    typical photograph's pixel is there, but for a least and a greatest number of steps."""
     silhouettes = _silhouettes(views)
-    return _field(silhouettes, _object_box(silhouettes), resolution)
+    box = _object_box(silhouettes)
+    return _field(silhouettes, box, resolution or _pixels_across(silhouettes, *box))
+
+
+def _pixels_across(silhouettes, lower, upper) -> int:
+    """Pixels along the longest side of a box in the typical view, within `_STEPS`."""
+    centre = (lower + upper) / 2
+    pixels = [np.mean(s.camera.focal) / np.linalg.norm(centre - s.camera.origin) for s in silhouettes]
+    return int(np.clip((upper - lower).max() * np.median(pixels), *_STEPS))
 
 
 def _field(silhouettes, box, resolution):
@@ -213,15 +227,13 @@ def _field(silhouettes, box, resolution):
     lower = lower - 2 * step  # the surface closes inside the grid
     coarse, shape = _grid(lower, upper + 2 * step, 4 * step)
     coarse = _carve(silhouettes, coarse, 8 * step).reshape(shape)
-    points, shape = _grid(lower, upper + 2 * step, step)
+    shape = _shape(lower, upper + 2 * step, step)
     # A distance changes by no more than the way gone, here at most 3.5 steps to the nearest coarse node: only where the
     # coarse field is smaller than that (and a margin) can the surface be.
-    nodes = np.stack(np.unravel_index(np.arange(len(points)), shape)) / np.float32(4)
-    values = ndimage.map_coordinates(coarse, nodes, order=1, mode="nearest")
-    band = np.abs(values) < 4.5 * step
-    values[band] = _carve(silhouettes, points[band], 3 * step)
-    values = np.clip(values, -3 * step, 3 * step).reshape(shape)
-    values = ndimage.gaussian_filter(values, 0.6)
+    values = ndimage.affine_transform(coarse, np.full(3, 1 / 4), output_shape=shape, order=1, mode="nearest")
+    band = np.argwhere(np.abs(values) < 4.5 * step)
+    values[tuple(band.T)] = _carve(silhouettes, (lower + step * band).astype(np.float32), 3 * step)
+    values = ndimage.gaussian_filter(np.clip(values, -3 * step, 3 * step), 0.6)
     for axis in range(3):
         np.moveaxis(values, axis, 0)[[0, -1]] = -step
     if values.max() <= 0:
@@ -238,29 +250,34 @@ def surface(field: SignedField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     nodes, faces, _, _ = marching_cubes(field.values, 0.0, gradient_direction="ascent")
     # Min has creases where cones meet, and marching cubes slivers: a gradient over a few steps is a steadier normal.
-    smooth = ndimage.gaussian_filter(field.values, 1.0)
-    gradient = [ndimage.map_coordinates(g, nodes.T, order=1) for g in np.gradient(smooth)]
-    normals = -np.stack(gradient, -1)
+    smooth = ndimage.gaussian_filter(field.values, 0.6)
+    beside = lambda offset: ndimage.map_coordinates(smooth, nodes.T + offset[:, None], order=1, mode="nearest")
+    normals = np.stack([beside(-axis) - beside(axis) for axis in np.eye(3)], -1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     vertices = (field.lower + field.step * nodes).astype(np.float32)
     return vertices, faces.astype(np.int32), normals.astype(np.float32)
 
 
 def sample_surface(vertices, faces, normals, count: int, rng) -> tuple[np.ndarray, np.ndarray]:
-    """``count`` points on a mesh, spread evenly: positions [count, 3] and unit normals [count, 3], float32.
+    """``count`` points on a mesh: positions [count, 3] and unit normals [count, 3], float32. They are spread evenly, but
+    up to four times as densely where the mesh bends.
 
-    Six times as many area-weighted samples are thinned to a Poisson-disk set, in rounds: a sample stays when no
+    Six times as many weighted samples are thinned to a Poisson-disk set, in rounds: a sample stays when no
     remaining neighbour comes before it in a random order. Too many are cut and too few topped up at random.
     """
     corners = vertices[faces].astype(np.float64)
     area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    face = rng.choice(len(faces), 6 * count, p=area / area.sum())
+    bend = np.sqrt(area.sum() / count) * _bend(faces, normals, area)
+    density = np.clip((bend / _BEND) ** 2, 1, _DENSER)
+    face = rng.choice(len(faces), 6 * count, p=area * density / (area * density).sum())
     u, v = np.sqrt(rng.random(6 * count)), rng.random(6 * count)
     weights = np.stack([1 - u, u * (1 - v), u * v], -1)[:, :, None]
     positions = (weights * corners[face]).sum(1)
 
-    radius = 0.69 * np.sqrt(area.sum() / count)
-    a, b = spatial.cKDTree(positions).query_pairs(radius, output_type="ndarray").T  # a < b: the index is the order
+    radius = 0.69 * np.sqrt((area * density).sum() / (count * density[face]))
+    a, b = spatial.cKDTree(positions).query_pairs(radius.max(), output_type="ndarray").T  # a < b: the index is the order
+    close = np.linalg.norm(positions[a] - positions[b], axis=1) < np.minimum(radius[a], radius[b])
+    a, b = a[close], b[close]
     state = np.zeros(6 * count, np.int8)  # 0 open, 1 kept, -1 removed
     while (state == 0).any():
         held = np.zeros(6 * count, bool)
@@ -275,6 +292,14 @@ def sample_surface(vertices, faces, normals, count: int, rng) -> tuple[np.ndarra
     normal = (weights[chosen] * normals[faces[face[chosen]]]).sum(1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     return positions[chosen].astype(np.float32), normal.astype(np.float32)
+
+
+def _bend(faces, normals, area):
+    """[F] how much the normals of a mesh change over a unit of length, averaged over neighbouring faces."""
+    corners = normals[faces].astype(np.float64)
+    change = np.linalg.norm(corners - corners.mean(1, keepdims=True), axis=2).max(1)
+    total = np.bincount(faces.ravel(), np.repeat(change * np.sqrt(area / 2), 3))  # of change over √(2 area), times the area
+    return (total / np.maximum(np.bincount(faces.ravel(), np.repeat(area, 3)), 1e-12))[faces].mean(1)
 
 
 def depth_maps(vertices, faces, cameras) -> list[np.ndarray]:

@@ -21,6 +21,7 @@ from ..splat.project import opaque
 from . import hull
 
 _WIDTH = 200  # pixels of a photograph's copy at most
+_STEPS = 160  # of the grid that is carved, at most; the hull's own may be finer
 _LEVELS = 40  # depths below the hull
 _REACH = 0.75  # the deepest, over the hull's radius
 _NEIGHBOURS, _BEST = 6, 3  # views that each is compared with, and those of them that count
@@ -35,10 +36,10 @@ _SEEN_THROUGH = 3  # views that look through what is carved
 _FLAT = 1e-4  # variance of grey levels in a window that shows nothing
 
 
-def carved_hull(views, resolution: int = 160, quiet: bool = True) -> hull.SignedField:
+def carved_hull(views, resolution: int | None = None, quiet: bool = True) -> hull.SignedField:
     """`hull.visual_hull` of ``views``, less what they look through; ``quiet``: no progress. Needs a JIT variant."""
-    field = hull.visual_hull(views, resolution)
-    vertices, faces, _ = hull.surface(field)
+    rough = hull.visual_hull(views, min(resolution or _STEPS, _STEPS))
+    vertices, faces, _ = hull.surface(rough)
     small = [Small.of(view) for view in views]
     depths = hull.depth_maps(vertices, faces, [s.camera for s in small])
     radius = float(np.linalg.norm(vertices - vertices.mean(0), axis=1).max())
@@ -48,7 +49,8 @@ def carved_hull(views, resolution: int = 160, quiet: bool = True) -> hull.Signed
         for i in range(len(small)):
             deeper.append(sweep(i, small, depths, step))
             progress.update((i + 1) / len(small), views=i + 1)
-    return carve(field, small, depths, _agreed(small, depths, deeper, step), step)
+    cut = carve(rough, small, depths, _agreed(small, depths, deeper, step), step)
+    return _least(hull.visual_hull(views, resolution), cut)
 
 
 class Small:
@@ -231,7 +233,8 @@ def _look(camera, points, *maps):
 
 
 def carve(field, small, depths, deeper, step):
-    """``field`` less the nodes through which several views look at something deeper."""
+    """The field of what is left of ``field`` without the nodes through which several views look at something deeper, close
+    to these; elsewhere three steps inside."""
     inside = np.argwhere(field.values > 0)
     points = field.lower + field.step * inside
     through = np.zeros(len(points), np.int64)
@@ -241,5 +244,12 @@ def carve(field, small, depths, deeper, step):
     gone = np.zeros(field.values.shape, bool)
     gone[tuple(inside[through >= _SEEN_THROUGH].T)] = True
     values = ndimage.gaussian_filter(np.where(gone, -field.step, field.values), 1.0)
-    values = np.where(ndimage.binary_dilation(gone, iterations=2), np.minimum(values, field.values), field.values)
+    values[~ndimage.binary_dilation(gone, iterations=2)] = 3 * field.step
     return hull.SignedField(values, field.lower, field.step)
+
+
+def _least(field, other):
+    """The lesser of two fields, on the grid of the first."""
+    scale, offset = field.step / other.step, (field.lower - other.lower) / other.step
+    values = ndimage.affine_transform(other.values, np.full(3, scale), offset, field.values.shape, order=1, mode="nearest")
+    return hull.SignedField(np.minimum(field.values, values), field.lower, field.step)
