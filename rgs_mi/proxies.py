@@ -60,16 +60,17 @@ class Proxies:
         self.two_sided = surfels.two_sided
 
     def meet(self, origin, normal, direction, active=True):
-        """(found, number): whether the ray of an ``active`` lane meets the front of a surfel, and which. ``normal``: of the
-        surface that the rays leave."""
+        """(found, number, place): whether the ray of an ``active`` lane meets the front of a surfel, which, and where on it
+        (see `Surfels.normals`). ``normal``: of the surface that the rays leave."""
         with dr.suspend_grad():
             ray = mi.Ray3f(mi.Point3f(origin + self.clearance * normal), mi.Vector3f(direction))
             hit = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
             found, number = hit.is_valid(), hit.prim_index // 2
             if not self.two_sided:
                 found &= dr.dot(dr.gather(mi.Vector3f, self.normal, number, found), ray.d) < 0
-            dr.eval(found, number)
-            return found, number
+            place = dr.gather(mi.Float, self.extent, number, found) * mi.Point2f(*self.position(hit))
+            dr.eval(found, number, place)
+            return found, number, place
 
     @staticmethod
     def position(hit):

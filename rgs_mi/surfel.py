@@ -100,6 +100,15 @@ class Surfels:
         ratio = dr.sqrt(scales.x / scales.y)
         return ratio * (K.x * t_u + K.y * t_v), (K.y * t_u + K.z * t_v) / ratio
 
+    def normals(self, place=None):
+        """Unit normals n + Δn in world space, ``mi.Vector3f`` of width N, in the middle of the surfels; with ``place``
+        (``mi.Point2f``: u, v in standard deviations from there) as turned as they are there."""
+        normal = self.frames()[2] + self.column(mi.Vector3f, "delta_normal")
+        if place is not None:
+            slope_u, slope_v = self.slopes()
+            normal = normal + place.x * slope_u + place.y * slope_v
+        return dr.normalize(normal)
+
     def radiance(self, direction):
         """Diffuse radiance of every surfel seen along unit ``direction`` (from the camera), ``mi.Color3f`` of width N."""
         basis = dr.sh_eval(direction, sh_order(self.sh.shape[1]))

@@ -24,6 +24,16 @@ def sphere_surfels(n, seed=0, scale=0.6, opacity_shift=1.0, order=1):
         "curvature": 0.3 * rng.normal(size=(n, 3))})
 
 
+def tangent_surfels(n, curvature=(0, 0, 0)):
+    """``n`` random surfels, all alike, that touch the unit sphere; ``curvature`` in units of the sphere's."""
+    scale = 0.6 * np.sqrt(4 * np.pi / n)
+    base = sphere_surfels(n).numpy()
+    return Surfels.from_numpy(base | {
+        "rotations": rotation_from_normal(base["centers"]), "delta_normal": np.zeros((n, 3)),
+        "curvature": np.tile(scale * np.array(curvature), (n, 1)), "scales": np.full((n, 2), scale),
+        "opacities": np.full((n, 1), 0.8)}, two_sided=False)
+
+
 def orbit_camera(angle=0.3, size=(48, 40), distance=4.0, fov=38.0):
     """A camera on a circle about the z axis that looks at the origin."""
     return Camera.look_at([distance * np.cos(angle), distance * np.sin(angle), 0.8], [0, 0, 0], [0, 0, 1], fov, size)

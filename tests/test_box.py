@@ -76,7 +76,8 @@ def test_rays_meet_what_is_in_the_box():
     direction = -target
     met = {}
     for box in (BOX, None):
-        found, number = Proxies(surfels, box=box).meet(mi.Point3f((3 * target).T), mi.Vector3f(0), mi.Vector3f(direction.T))
+        rays = mi.Point3f((3 * target).T), mi.Vector3f(0), mi.Vector3f(direction.T)
+        found, number, _ = Proxies(surfels, box=box).meet(*rays)
         met[box] = centers[number.numpy()[found.numpy()], 1]
         assert len(met[box]) > 500
     assert (met[BOX] <= 0).all() and (met[None] > 0).mean() > 0.3

@@ -18,7 +18,7 @@ from rgs_mi.shading.monte_carlo import MonteCarlo
 from rgs_mi.shading.split_sum import DEFAULT_ETA, SplitSum
 from rgs_mi.surfel import CHANNELS, SH_0, Surfels, rotation_from_normal
 
-from scenes import sphere_surfels
+from scenes import sphere_surfels, tangent_surfels
 
 SIZE = (96, 96)
 CAMERA = Camera.look_at([0, -3, 1.2], [0, 0, 0.3], [0, 0, 1], 40, SIZE)
@@ -27,20 +27,21 @@ WALL = np.array([0.9, 0.3, 0.1])  # radiance
 
 
 def brute_force(surfels, origin, direction, solid=0.2):
-    """[R] number of the nearest quad that each ray meets (-1: none), and whether it meets its front."""
+    """[R] number of the nearest quad that each ray meets (-1: none), whether it meets its front, and where [R, 2], in
+    standard deviations from its middle."""
     s = {name: value.astype(np.float64) for name, value in surfels.numpy().items()}
     t_u, t_v, normal = (np.array(v).T for v in surfels.frames())
     extent = np.sqrt(2 * np.log(np.maximum(s["opacities"] / solid, 1)))
     nearest, number, front = np.full(len(origin), np.inf), np.full(len(origin), -1), np.zeros(len(origin), bool)
+    place = np.zeros((len(origin), 2))
     for i in range(len(surfels)):
         cosine = direction @ normal[i]
         t = ((s["centers"][i] - origin) @ normal[i]) / cosine
         offset = origin + t[:, None] * direction - s["centers"][i]
-        half = extent[i] * s["scales"][i]
-        inside = (abs(offset @ t_u[i]) < half[0]) & (abs(offset @ t_v[i]) < half[1])
-        met = inside & (t > 0) & (t < nearest)
-        nearest[met], number[met], front[met] = t[met], i, cosine[met] < 0
-    return number, front
+        uv = np.stack([offset @ t_u[i], offset @ t_v[i]], 1) / s["scales"][i]
+        met = (abs(uv) < extent[i]).all(1) & (t > 0) & (t < nearest)
+        nearest[met], number[met], front[met], place[met] = t[met], i, cosine[met] < 0, uv[met]
+    return number, front, place
 
 
 @pytest.mark.parametrize("two_sided", [True, False])
@@ -51,12 +52,44 @@ def test_rays_meet_what_brute_force_says(two_sided):
     direction = 0.5 * rng.normal(size=(4000, 3)) - origin  # inwards, mostly
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     normal = np.zeros((4000, 3))
-    found, number = Proxies(surfels).meet(mi.Point3f(origin.T), mi.Vector3f(normal.T), mi.Vector3f(direction.T))
-    expected, front = brute_force(surfels, origin, direction)
+    found, number, place = Proxies(surfels).meet(mi.Point3f(origin.T), mi.Vector3f(normal.T), mi.Vector3f(direction.T))
+    expected, front, where = brute_force(surfels, origin, direction)
     met = (expected >= 0) & (front | two_sided)
     assert 0.1 < met.mean() < 0.9
     differs = (found.numpy() != met) | met & (number.numpy() != expected)
     assert differs.mean() < 1e-3  # rays along an edge, in single precision
+    assert np.allclose(place.numpy().T[met & ~differs], where[met & ~differs], atol=1e-3)
+
+
+def test_what_rays_meet_reflects_by_normals_that_turn():
+    """A ball of mirrors in a light that changes slowly: what comes from it is that of a sphere, many times as well as with
+    surfels of one normal each."""
+    rng = np.random.default_rng(0)
+    polar, azimuth = np.meshgrid(np.linspace(0, np.pi, 16), np.arange(32) * np.pi / 16, indexing="ij")
+    texels = 0.5 + 0.4 * np.stack([np.cos(polar), np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth)], -1)
+    estimator = SplitSum(Environment(mi.TensorXf(texels.astype(np.float32)), np.eye(3)).filtered())
+    point = rng.normal(size=(4000, 3))
+    point /= np.linalg.norm(point, axis=1, keepdims=True)
+    towards = 0.5 * rng.normal(size=(4000, 3)) - point
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    ahead = (point * towards).sum(1) < -0.5
+    normal, direction = mi.Vector3f(point[ahead].T), mi.Vector3f(towards[ahead].T)
+    expected = estimator.specular(normal, -direction, mi.Float(0.1), mi.Float(1), mi.Color3f(1)).numpy()
+
+    def error(curvature):
+        base = tangent_surfels(400, curvature).numpy()
+        full = lambda name, value: {name: np.full_like(base[name], value)}
+        surfels = Surfels.from_numpy(base | full("roughness", 0.1) | full("metallic", 1) | full("base_color", 1)
+                                     | {"sh": np.full((400, 3), -0.5 / SH_0)}, two_sided=False)
+        indirect = Indirect("one_bounce", Proxies(surfels), surfels)
+        none = dr.zeros(mi.Color3f, dr.width(direction))
+        mine = indirect.cover(none, mi.Point3f(normal - direction), mi.Vector3f(0), direction,
+                              deferred.Lighting(estimator, indirect=indirect)).numpy()
+        met = mine.max(0) > 0
+        assert met.mean() > 0.9
+        return abs(mine - expected)[:, met].mean()
+
+    assert 3 * error([1, 0, 1]) < error([0, 0, 0])
 
 
 def plate(origin, across, up, count=60):

@@ -10,9 +10,9 @@ import pytest
 from rgs_mi.splat import gbuffer
 from rgs_mi.splat.reference import render_gbuffer_reference
 from rgs_mi.splat.tiles import Cutoffs
-from rgs_mi.surfel import CHANNELS, Surfels, rotation_from_normal
+from rgs_mi.surfel import CHANNELS, Surfels
 
-from scenes import layered_surfels, orbit_camera, sphere_surfels
+from scenes import layered_surfels, orbit_camera, sphere_surfels, tangent_surfels
 
 MAPS = ("diffuse", "normal", "base_color", "roughness", "metallic", "delta_normal", "depth", "square", "alpha")
 SORTED = Cutoffs(window=96)  # more than the surfels of any tile here that overlap
@@ -85,12 +85,7 @@ def test_window_brings_tiles_into_order():
 
 def test_curved_surfels_have_the_normals_of_a_sphere():
     """Surfels that touch a unit sphere: with its curvature they show its normals many times as well as without."""
-    camera, n = orbit_camera(size=(96, 96)), 400
-    scale = 0.6 * np.sqrt(4 * np.pi / n)
-    centers = sphere_surfels(n).numpy()["centers"]
-    flat = sphere_surfels(n).numpy() | {
-        "rotations": rotation_from_normal(centers), "delta_normal": np.zeros((n, 3)), "curvature": np.zeros((n, 3)),
-        "scales": np.full((n, 2), scale), "opacities": np.full((n, 1), 0.8)}
+    camera = orbit_camera(size=(96, 96))
     directions = camera.rays().reshape(-1, 3)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     closest = -directions @ camera.origin
@@ -99,8 +94,7 @@ def test_curved_surfels_have_the_normals_of_a_sphere():
     true = camera.origin + (closest - np.sqrt(np.maximum(inside, 0)))[:, None] * directions
 
     def degrees(curvature):
-        surfels = Surfels.from_numpy(flat | {"curvature": np.tile(scale * np.array(curvature), (n, 1))}, two_sided=False)
-        normal = render_gbuffer(surfels, camera).normal.numpy().T
+        normal = render_gbuffer(tangent_surfels(400, curvature), camera).normal.numpy().T
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
         return np.degrees(np.arccos(np.clip((normal * true).sum(1)[seen], -1, 1))).mean()
 

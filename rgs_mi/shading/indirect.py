@@ -43,21 +43,22 @@ class Indirect:
         takes the place of a ``part`` of it."""
         part = mi.Float(part)
         dr.eval(incoming, point, normal, direction, part)
-        found, number = self.proxies.meet(*(dr.detach(v) for v in (point, normal, direction)), dr.detach(part) > 0)
+        found, number, place = self.proxies.meet(*(dr.detach(v) for v in (point, normal, direction)), dr.detach(part) > 0)
         lanes = dr.compress(found)
         light = dr.zeros(mi.Color3f, dr.width(found))
         if self.kind == "one_bounce" and dr.width(lanes) > 0:
             d = mi.Vector3f(*(dr.gather(mi.Float, c, lanes, mode=dr.ReduceMode.NoConflicts) for c in direction))
-            dr.scatter(light, self._radiance(dr.gather(mi.UInt32, number, lanes), d, lighting), lanes)
+            number, place = dr.gather(mi.UInt32, number, lanes), dr.gather(mi.Point2f, place, lanes)
+            dr.scatter(light, self._radiance(number, place, d, lighting), lanes)
         return dr.select(found, dr.lerp(incoming, light, part), incoming)
 
     def with_share(self, lighting, seed) -> "Indirect":
         """The same with `share`, where surfels are lit by ``lighting``, whose estimator is the split sum; ``seed``:
         ``mi.UInt32``."""
         with dr.suspend_grad():
-            share = self._share(self._normals(self.surfels), lighting, seed)
+            share = self._share(self.surfels.normals(), lighting, seed)
             if self.surfels.two_sided:  # the side that shows is the one that light reaches
-                share = dr.maximum(share, self._share(-self._normals(self.surfels), lighting, seed))
+                share = dr.maximum(share, self._share(-self.surfels.normals(), lighting, seed))
             dr.eval(share)
         return replace(self, share=share)
 
@@ -83,14 +84,11 @@ class Indirect:
             dr.scatter(sh, (self.share[k] - 0.5) / SH_0 if k < 3 else mi.Float(0), row + k, inside)
         return replace(surfels, sh=mi.TensorXf(sh, shape))
 
-    @staticmethod
-    def _normals(surfels):
-        return dr.normalize(surfels.frames()[2] + surfels.column(mi.Vector3f, "delta_normal"))
-
-    def _radiance(self, number, direction, lighting):
-        """What the surfels ``number`` send against ``direction``; they in turn reflect the environment alone."""
+    def _radiance(self, number, place, direction, lighting):
+        """What the surfels ``number`` send against ``direction`` from a ``place`` on them; they in turn reflect the
+        environment alone."""
         met = self.surfels.take(number)
-        normal = self._normals(met)
+        normal = met.normals(place)
         if met.two_sided:
             normal = dr.mulsign(normal, -dr.dot(direction, normal))
         lighting = lighting.seen_again()
