@@ -47,7 +47,7 @@ class Rates:
     metallic: tuple[float, float] = (2e-2, 4e-3)
     delta_normal: tuple[float, float] = (1e-3, 1e-4)
     curvature: tuple[float, float] = (2e-3, 2e-4)
-    environment: tuple[float, float] = (3e-2, 5e-3)
+    environment: tuple[float, float] = (6e-2, 5e-3)
     shader: tuple[float, float] = (1e-2, 1e-3)
 
 
