@@ -15,8 +15,8 @@ def main():
     parser.add_argument("--environments", type=listed(), metavar="A,B", help="of the suite (default: three)")
     parser.add_argument("--roughness", type=listed(float), metavar="R,S", help="of materials (default: seven, 0.02 to 1)")
     parser.add_argument("--size", type=int, default=64, help="pixels along a side (default: %(default)s)")
-    parser.add_argument("--samples", type=int, default=64,
-                        help="per pixel, of each of 16 batches of the path tracer; ours take four times as many "
+    parser.add_argument("--samples", type=int, default=128,
+                        help="per pixel, of each of 16 batches of the path tracer; ours take twice as many "
                              "(default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of everything random (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("runs") / "crossvalidation", metavar="DIR",

@@ -149,8 +149,8 @@ class Result:
 
 
 class Validator:
-    """Compares cases with ``size`` pixels along a side, ``samples`` per pixel and batch of the path tracer's, and four times
-    as many of ours, which cost less. Raises: UserError where these are too few."""
+    """Compares cases with ``size`` pixels along a side, ``samples`` per pixel and batch of the path tracer's, and twice as
+    many of ours, which cost less. Raises: UserError where these are too few."""
 
     def __init__(self, size=64, samples=64, seed=0):
         if size < 2 or samples < 2:
@@ -171,7 +171,7 @@ class Validator:
         environment = Environment.from_emitter(scene.environment())
 
         def sampled(seed):
-            estimator = MonteCarlo(environment.unfiltered(), scene.environment(), DEFAULT_ETA, 4 * self.samples,
+            estimator = MonteCarlo(environment.unfiltered(), scene.environment(), DEFAULT_ETA, 2 * self.samples,
                                    dr.opaque(mi.UInt32, seed))
             return _radiance(estimator, case, surfaces, cover)
 
