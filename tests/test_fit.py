@@ -197,7 +197,7 @@ def test_no_kernel_is_compiled_after_warm_up(dataset, indirect, diffuse, monkeyp
     settings = replace(SETTINGS, iterations=1000, indirect=indirect, indirect_start=0.0)
     fit = Fit(dataset, model(), settings, 1.0, Shading(diffuse=diffuse))
     centers = fit.model.numpy("centers")
-    fit.model.set("centers", centers + np.where(np.arange(len(centers)) % 2, 0, 1.2)[:, None])  # two balls, side by side
+    fit.model.set("centers", centers + np.where(np.arange(len(centers)) % 2, 0, 1.5)[:, None])  # two balls, side by side
     for n in (290, 270):
         for _ in range(4):
             fit.step()
