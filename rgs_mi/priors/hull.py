@@ -209,9 +209,14 @@ def carve(views, box, resolution: int = 160) -> SignedField:
 def visual_hull(views, resolution: int | None = None) -> SignedField:
     """`carve` inside `object_box`, measuring the silhouettes once. Unless ``resolution`` is given, a step is as long as the
     typical photograph's pixel is there, but for a least and a greatest number of steps."""
+    return visual_hulls(views, resolution)[0]
+
+
+def visual_hulls(views, *resolutions: int | None) -> list[SignedField]:
+    """`visual_hull` at each of ``resolutions``, measuring silhouettes and box once for all."""
     silhouettes = _silhouettes(views)
     box = _object_box(silhouettes)
-    return _field(silhouettes, box, resolution or _pixels_across(silhouettes, *box))
+    return [_field(silhouettes, box, resolution or _pixels_across(silhouettes, *box)) for resolution in resolutions]
 
 
 def _pixels_across(silhouettes, lower, upper) -> int:

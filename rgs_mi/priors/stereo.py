@@ -38,7 +38,7 @@ _FLAT = 1e-4  # variance of grey levels in a window that shows nothing
 
 def carved_hull(views, resolution: int | None = None, quiet: bool = True) -> hull.SignedField:
     """`hull.visual_hull` of ``views``, less what they look through; ``quiet``: no progress. Needs a JIT variant."""
-    rough = hull.visual_hull(views, min(resolution or _STEPS, _STEPS))
+    field, rough = hull.visual_hulls(views, resolution, min(resolution or _STEPS, _STEPS))
     vertices, faces, _ = hull.surface(rough)
     small = [Small.of(view) for view in views]
     depths = hull.depth_maps(vertices, faces, [s.camera for s in small])
@@ -50,7 +50,7 @@ def carved_hull(views, resolution: int | None = None, quiet: bool = True) -> hul
             deeper.append(sweep(i, small, depths, step))
             progress.update((i + 1) / len(small), views=i + 1)
     cut = carve(rough, small, depths, _agreed(small, depths, deeper, step), step)
-    return _least(hull.visual_hull(views, resolution), cut)
+    return _least(field, cut)
 
 
 class Small:
