@@ -241,15 +241,17 @@ class Fit:
         return dr.detach(loss)
 
     def _regional(self, i, gbuffer, photo):
-        """RGS's losses of view ``i`` that are normalised by regions of their own, L_normal and L_depth; notes what is
-        reflective for density control."""
+        """Losses of view ``i`` that are normalised by regions of their own: RGS's L_normal and L_depth, and fairness. Notes
+        what is reflective for density control."""
         w, maps, parts = self.settings.weights, gbuffer.all, {}
-        if w.normal > 0 or self.settings.density.guided:
+        if max(w.normal, w.fairness) > 0 or self.settings.density.guided:
             mask = self._reflective_mask(gbuffer, photo.camera)
             if self.settings.density.guided:
                 self._reflective[i] = photo.camera, boxes(mask)
             if w.normal > 0:
                 parts["loss.normal"] = w.normal * losses.normal_smoothness(gbuffer, mask, w.crease)
+            if w.fairness > 0:
+                parts["loss.fairness"] = w.fairness * losses.fairness(gbuffer, mask, divmod(self.step_number % 4, 2))
         if w.depth > 0 and photo.prior is not None:
             covered = maps.alpha > 0.5
             depth = maps.depth / dr.select(covered, maps.alpha, 1)

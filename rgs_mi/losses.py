@@ -13,6 +13,7 @@ SATURATED = 0.995  # display value from which a photograph only says "at least t
 _WINDOW, _SIGMA = 11, 1.5  # SSIM's Gaussian window
 _C1, _C2 = 0.01**2, 0.03**2
 _SLOPE = 4.0  # change of log radiance per radian up to which it counts by its square
+_APART, _BEND = 0.015, 0.015  # of `fairness`: part of the image's width; radians
 _FLAT = 1e-6  # standard deviation of a depth map, in units of its depth, up to which it is constant
 
 
@@ -148,6 +149,34 @@ def normal_smoothness(gbuffer, reflective, crease=0.0):
         total += dr.sum(dr.select(counted, d2 / (1 + d2 / crease**2) if crease > 0 else d2, 0))
         pairs += mi.Float(dr.count(counted))
     return 2 * total / dr.maximum(pairs, 1)
+
+
+def fairness(gbuffer, reflective, corner=(0, 0)):
+    """How fast the curvature of smooth surfaces changes (minimum-variation surfaces, Moreton and Séquin 1992). Where a flat
+    mirror shows each part of the environment to few photographs, they agree with any wobble of it; held-out views don't.
+
+        mean of d² / (1 + d²/ε²),   d = ‖N(p + s) − 2 N(p) + N(p − s)‖
+
+    over pixels p and steps s, to the right and down, of `_APART` image widths; N: unit normals. What changes by more than
+    ε = `_BEND`, an edge or the end of one, is let be. All three pixels are ``reflective`` (β̂, [H, W] bool, NumPy). Of every
+    2 × 2 pixels only the one at ``corner`` (row, column) is a p.
+    """
+    width = gbuffer.size[0]
+    apart = max(1, round(_APART * width))
+    total, count = mi.Float(0), 0
+    for axis, stride in ((1, apart), (0, apart * width)):
+        triple = reflective & np.roll(reflective, apart, axis) & np.roll(reflective, -apart, axis)
+        np.moveaxis(triple, axis, 0)[:apart] = np.moveaxis(triple, axis, 0)[-apart:] = False  # rolled in from the other side
+        chosen = np.zeros_like(triple)
+        chosen[corner[0]::2, corner[1]::2] = triple[corner[0]::2, corner[1]::2]
+        index, step = dr.compress(lanes(chosen) > 0), dr.opaque(mi.UInt32, stride)
+        if dr.width(index) == 0:
+            continue
+        here, ahead, behind = (dr.normalize(gbuffer.maps(i).normal) for i in (index, index + step, index - step))
+        d2 = dr.squared_norm(ahead - 2 * here + behind)
+        total += dr.sum(d2 / (1 + d2 / _BEND**2))
+        count += dr.width(index)
+    return total / dr.opaque(mi.Float, max(count, 1))
 
 
 def delta_normal(gbuffer):

@@ -62,6 +62,7 @@ class Weights:
     distortion: float = _within(0.0, 0, 1e6)  # of the surfels along a ray (2DGS)
     normal: float = _within(0.1, 0, 1e3)  # smoothness of the normals of what is reflective (RGS, L_normal)
     crease: float = _within(0.1, 0, 1e3)  # difference of unit normals from pixel to pixel that it lets be; 0: none
+    fairness: float = _within(30.0, 0, 1e6)  # change of curvature where what is reflective is smooth
     delta_normal: float = _within(0.0, 0, 1e3)  # length of the normals' residuals (RGS, L_Δn)
     depth: float = _within(1e-3, 0, 1e3)  # correlation with the depth prior (RGS, L_depth)
     light: float = _within(1e-5, 0, 1e3)  # total variation of the environment: what nothing reflects sharply stays smooth

@@ -10,7 +10,7 @@ from rgs_mi import losses
 from rgs_mi.aligned import lanes as aligned
 from rgs_mi.camera import Camera
 from rgs_mi.color import srgb_encode
-from rgs_mi.splat.gbuffer import render_gbuffer
+from rgs_mi.splat.gbuffer import GBuffer, render_gbuffer
 from rgs_mi.surfel import Surfels, rotation_from_normal
 
 from scenes import orbit_camera, sphere_surfels
@@ -110,6 +110,38 @@ def test_normal_smoothness_equals_numpy(crease):
     expected = 2 * pairs.mean()
     assert len(pairs) > 100
     assert losses.normal_smoothness(gbuffer, smooth, crease)[0] == pytest.approx(expected, rel=1e-4)
+
+
+def test_fairness_equals_numpy():
+    """Value and gradient, on a cylinder that wobbles, with an edge."""
+    width, height, apart, rng = 120, 50, 2, np.random.default_rng(5)
+    angle = np.linspace(0, 0.8, width) + 0.7 * (np.arange(width) > 75) + rng.normal(0, 0.01, (height, width))
+    image = rng.random((height, width, 16))
+    image[..., 3:6] = 1.5 * np.stack([np.sin(angle), rng.normal(0, 0.01, angle.shape), np.cos(angle)], -1)
+    reflective = rng.random((height, width)) > 0.1
+
+    def twin(image):
+        N = image[..., 3:6] / np.linalg.norm(image[..., 3:6], axis=-1, keepdims=True)
+        total = count = 0
+        for y, x in np.ndindex(height, width):
+            for dy, dx in ((0, apart), (apart, 0)):
+                inside = dy <= y < height - dy and dx <= x < width - dx and (y % 2, x % 2) == (1, 0)
+                if inside and reflective[y, x] and reflective[y - dy, x - dx] and reflective[y + dy, x + dx]:
+                    d2 = ((N[y + dy, x + dx] - 2 * N[y, x] + N[y - dy, x - dx]) ** 2).sum()
+                    total += d2 / (1 + d2 / 0.015**2)
+                    count += 1
+        return total / count
+
+    maps = aligned(image)
+    dr.enable_grad(maps)
+    gbuffer = GBuffer((width, height), maps, seen=None)
+    value = losses.fairness(gbuffer, reflective, corner=(1, 0))
+    dr.backward(value)
+    assert value[0] == pytest.approx(twin(image), rel=1e-4)
+    along = rng.normal(size=image.shape)
+    change = (twin(image + 1e-6 * along) - twin(image - 1e-6 * along)) / 2e-6
+    assert (dr.grad(maps).numpy() * along.ravel()).sum() == pytest.approx(change, rel=1e-3)
+    assert losses.fairness(gbuffer, np.zeros_like(reflective))[0] == 0
 
 
 def test_distortion_is_the_sum_over_pairs():
