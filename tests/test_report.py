@@ -146,7 +146,7 @@ def test_curves_of_a_run(run):
     rows = [dict(zip(lines[0].split(","), line.split(","))) for line in lines[1:]]
     assert [int(row["step"]) for row in rows] == list(range(1, 13))
     assert [row["pixels"] for row in rows] == ["16"] * 6 + ["32"] * 6
-    assert {"loss.photometric", "loss.mask", "loss.consistency", "loss.normal"} <= set(rows[0])
+    assert {"loss.photometric", "loss.mask", "loss.consistency", "loss.normal", "loss.fairness"} <= set(rows[0])
     assert all(float(row["ms"]) > 0 and float(row["psnr"]) > 0 and int(row["surfels"]) > 0 for row in rows)
     assert float(rows[-1]["seconds"]) == pytest.approx(metrics(run)["train_seconds"])
 
