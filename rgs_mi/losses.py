@@ -155,11 +155,12 @@ def fairness(gbuffer, reflective, corner=(0, 0)):
     """How fast the curvature of smooth surfaces changes (minimum-variation surfaces, Moreton and Séquin 1992). Where a flat
     mirror shows each part of the environment to few photographs, they agree with any wobble of it; held-out views don't.
 
-        mean of d² / (1 + d²/ε²),   d = ‖N(p + s) − 2 N(p) + N(p − s)‖
+        mean of F d² / (1 + d²/ε²),   d = ‖N(p + s) − 2 N(p) + N(p − s)‖,   F = lerp(0.04, 1, metallic(p))
 
     over pixels p and steps s, to the right and down, of `_APART` image widths; N: unit normals. What changes by more than
-    ε = `_BEND`, an edge or the end of one, is let be. All three pixels are ``reflective`` (β̂, [H, W] bool, NumPy). Of every
-    2 × 2 pixels only the one at ``corner`` (row, column) is a p.
+    ε = `_BEND`, an edge or the end of one, is let be. F, which has no gradient, is what is reflected at normal incidence: it
+    keeps the balance with the photographs, which say the less about normals the less is reflected. All three pixels are
+    ``reflective`` (β̂, [H, W] bool, NumPy). Of every 2 × 2 pixels only the one at ``corner`` (row, column) is a p.
     """
     width = gbuffer.size[0]
     apart = max(1, round(_APART * width))
@@ -174,7 +175,8 @@ def fairness(gbuffer, reflective, corner=(0, 0)):
             continue
         here, ahead, behind = (dr.normalize(gbuffer.maps(i).normal) for i in (index, index + step, index - step))
         d2 = dr.squared_norm(ahead - 2 * here + behind)
-        total += dr.sum(d2 / (1 + d2 / _BEND**2))
+        reflectance = dr.lerp(0.04, 1, dr.detach(gbuffer.maps(index).metallic))
+        total += dr.sum(reflectance * d2 / (1 + d2 / _BEND**2))
         count += dr.width(index)
     return total / dr.opaque(mi.Float, max(count, 1))
 

@@ -118,7 +118,7 @@ def test_fairness_equals_numpy():
     angle = np.linspace(0, 0.8, width) + 0.7 * (np.arange(width) > 75) + rng.normal(0, 0.01, (height, width))
     image = rng.random((height, width, 16))
     image[..., 3:6] = 1.5 * np.stack([np.sin(angle), rng.normal(0, 0.01, angle.shape), np.cos(angle)], -1)
-    reflective = rng.random((height, width)) > 0.1
+    reflective, reflectance = rng.random((height, width)) > 0.1, 0.04 + 0.96 * image[..., 10]
 
     def twin(image):
         N = image[..., 3:6] / np.linalg.norm(image[..., 3:6], axis=-1, keepdims=True)
@@ -128,7 +128,7 @@ def test_fairness_equals_numpy():
                 inside = dy <= y < height - dy and dx <= x < width - dx and (y % 2, x % 2) == (1, 0)
                 if inside and reflective[y, x] and reflective[y - dy, x - dx] and reflective[y + dy, x + dx]:
                     d2 = ((N[y + dy, x + dx] - 2 * N[y, x] + N[y - dy, x - dx]) ** 2).sum()
-                    total += d2 / (1 + d2 / 0.015**2)
+                    total += reflectance[y, x] * d2 / (1 + d2 / 0.015**2)
                     count += 1
         return total / count
 
