@@ -158,9 +158,10 @@ def fairness(gbuffer, reflective, corner=(0, 0)):
         mean of F d² / (1 + d²/ε²),   d = ‖N(p + s) − 2 N(p) + N(p − s)‖,   F = lerp(0.04, 1, metallic(p))
 
     over pixels p and steps s, to the right and down, of `_APART` image widths; N: unit normals. What changes by more than
-    ε = `_BEND`, an edge or the end of one, is let be. F, which has no gradient, is what is reflected at normal incidence: it
-    keeps the balance with the photographs, which say the less about normals the less is reflected. All three pixels are
-    ``reflective`` (β̂, [H, W] bool, NumPy). Of every 2 × 2 pixels only the one at ``corner`` (row, column) is a p.
+    ε = `_BEND`, an edge or the end of one, is let be. F, which has no gradient, is what is reflected at normal incidence
+    (metals as if white): it keeps the balance with the photographs, which say the less about normals the less is reflected.
+    All three pixels are ``reflective`` (β̂, [H, W] bool, NumPy). Of every 2 × 2 pixels only the one at ``corner`` (row,
+    column) is a p.
     """
     width = gbuffer.size[0]
     apart = max(1, round(_APART * width))
@@ -173,9 +174,10 @@ def fairness(gbuffer, reflective, corner=(0, 0)):
         index, step = dr.compress(lanes(chosen) > 0), dr.opaque(mi.UInt32, stride)
         if dr.width(index) == 0:
             continue
-        here, ahead, behind = (dr.normalize(gbuffer.maps(i).normal) for i in (index, index + step, index - step))
-        d2 = dr.squared_norm(ahead - 2 * here + behind)
-        reflectance = dr.lerp(0.04, 1, dr.detach(gbuffer.maps(index).metallic))
+        here, ahead, behind = (gbuffer.maps(i) for i in (index, index + step, index - step))
+        n = lambda maps: dr.normalize(maps.normal)
+        d2 = dr.squared_norm(n(ahead) - 2 * n(here) + n(behind))
+        reflectance = dr.lerp(0.04, 1, dr.detach(here.metallic))
         total += dr.sum(reflectance * d2 / (1 + d2 / _BEND**2))
         count += dr.width(index)
     return total / dr.opaque(mi.Float, max(count, 1))
