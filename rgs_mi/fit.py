@@ -283,6 +283,9 @@ class Fit:
         # A light that has no shape yet would turn normals that the hull has right. Two-sided surfels began at random.
         if self.progress < self.settings.normals_start and not self.model.two_sided:
             rate |= {name: _HELD * rate[name] for name in _NORMALS}
+        # Adam's steps are as long as its rates, however little there is to gain: what is right trembles to the last
+        if self.progress > 1 - self.settings.cooldown:
+            rate = {name: value * (1 - self.progress) / self.settings.cooldown for name, value in rate.items()}
         self.model.optimizer.set_learning_rate(rate)
 
     def _control_density(self):

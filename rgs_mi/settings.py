@@ -102,6 +102,7 @@ class Settings:
     specular_start: float = _within(0.0, 0, 1)  # fraction of the fit from which reflections are shaded; 1: never
     # Fraction of the fit from which the normals of a start on the hull move at their rates; before, at a tenth of them
     normals_start: float = _within(0.2, 0, 1)
+    cooldown: float = _within(0.05, 0, 1)  # the last fraction of the fit, in which all rates fall to zero
     # Lower and upper corner of the box around the object, in captures without masks: what reflects. Unless given, it is
     # half as far from the point that the cameras look at as the nearest of them
     box: tuple[float, float, float, float, float, float] | None = None

@@ -271,6 +271,16 @@ def test_normals_of_a_hull_wait_for_the_light(dataset, two_sided, normals_start,
     assert fit.model.optimizer.learning_rate("rotations") == pytest.approx(2e-3 * 0.1**0.2)
 
 
+@pytest.mark.parametrize("cooldown, parts", [(0.25, [1, 1, 0.5, 0.1]), (0.0, [1, 1, 1, 1])])
+def test_rates_fall_to_zero_in_the_end(dataset, cooldown, parts):
+    fit = Fit(dataset, model(), replace(SETTINGS, cooldown=cooldown), 1.0)
+    for fit.step_number, part in zip((20, 30, 35, 39), parts):
+        fit._set_rates()
+        for name, (first, last) in (("centers", (5e-4, 1e-5)), ("log_environment", (6e-2, 5e-3))):
+            rate = first * (last / first) ** (fit.step_number / 40)
+            assert fit.model.optimizer.learning_rate(name) == pytest.approx(part * rate)
+
+
 @pytest.mark.parametrize("where, opacity", [("hull", 0.7), ("points", 0.7), ("anywhere", 0.1)])
 def test_opacities_to_start_with(dataset, where, opacity):
     points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
