@@ -29,6 +29,8 @@ _RATES = {"centers": "centers", "rotations": "rotations", "log_scales": "scales"
           ENVIRONMENT: "environment", SHADER: "shader"}
 _NORMALS, _HELD = ("rotations", "delta_normal", "curvature"), 0.1  # the part of their rates that they have at first
 _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
+# A mirror ball, of 3/8 of the picture, turns what its middle reflects by 2/r a pixel: it has a row for each at π r/2 rows
+_ROWS_A_PIXEL, _MOST_ROWS = 3 * np.pi / 16, 512
 _DIVERGED = 10  # steps in a row without a finite error
 
 
@@ -169,6 +171,7 @@ class Fit:
         stage, s = self.stage, self.settings
         if self.photographs is None or self.photographs.downscale != stage.downscale:
             self.photographs = Photographs(self.dataset.train, stage.downscale, s.background, self.priors)
+        self._refine_environment()
         self._set_rates()
         views = self._next_views(stage.views)
         surfels = self.model.surfels(self.sh_order)
@@ -267,6 +270,15 @@ class Fit:
             chosen.append(int(order[k % n]))
         self.views_used += count
         return chosen
+
+    def _refine_environment(self):
+        """Double the environment's rows, up to `_MOST_ROWS`, while photographs tell more apart."""
+        if self.progress < self.settings.refine_start:
+            return
+        rows = self.model[ENVIRONMENT].shape[0]
+        while 2 * rows <= _MOST_ROWS and np.sqrt(2) * rows < _ROWS_A_PIXEL * self.pixels:
+            self.model.refine_environment()
+            rows *= 2
 
     def _scheduled(self, pair):
         """The value of a (first, last) pair at this point of the fit: geometrically between them, linearly from or to 0."""

@@ -123,6 +123,16 @@ class Model:
             self.set(name, changes.get(name, value[index]))
             self._set_moments(name, t, *map(lanes, moments))
 
+    def refine_environment(self):
+        """Twice as many rows and columns of environment, on which the logarithm of radiance and its moments are as before:
+        a texel is a quarter of the old one, and so is its derivative."""
+        value = self.optimizer[ENVIRONMENT]
+        t, m, v, _ = self.optimizer.state[ENVIRONMENT][3]
+        finer = lambda texels: Environment(mi.TensorXf(texels, value.shape), self.rotation).finer().texels
+        m, v = (lanes(finer(moment).numpy().ravel() * part) for moment, part in ((m, 1 / 4), (v, 1 / 16)))
+        self.set(ENVIRONMENT, finer(dr.detach(value).array).numpy())
+        self._set_moments(ENVIRONMENT, t, m, v)
+
     def _set_moments(self, name, t, m, v):
         value, promoted, lr, _ = self.optimizer.state[name]
         self.optimizer.state[name] = value, promoted, lr, (t, m, v, None)

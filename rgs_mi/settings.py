@@ -107,6 +107,8 @@ class Settings:
     # half as far from the point that the cameras look at as the nearest of them
     box: tuple[float, float, float, float, float, float] | None = None
     reflective: float = _within(0.9, 0, 1)  # the fraction of a view's foreground, smoothest first, that is reflective
+    # Fraction of the fit from which the environment's rows double, where photographs have the pixels to tell them apart
+    refine_start: float = _within(0.5, 0, 1)
     shader: Literal["identity", "mlp"] = "identity"  # f_φ of C = C_d + f_φ(C_s): nothing, or a tiny network trained along
     indirect: Literal["none", "visibility", "one_bounce"] = "one_bounce"  # what reflected rays that meet surfels bring
     indirect_start: float = _within(0.1, 0, 1)  # fraction of the fit from which they are traced

@@ -5,11 +5,14 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
 import rgs_mi
+from rgs_mi import fit as fit_module
 from rgs_mi import losses
+from rgs_mi.aligned import lanes
 from rgs_mi.density import Gradients
 from rgs_mi.fit import Fit
 from rgs_mi.model import Model
@@ -279,6 +282,47 @@ def test_rates_fall_to_zero_in_the_end(dataset, cooldown, parts):
         for name, (first, last) in (("centers", (5e-4, 1e-5)), ("log_environment", (6e-2, 5e-3))):
             rate = first * (last / first) ** (fit.step_number / 40)
             assert fit.model.optimizer.learning_rate(name) == pytest.approx(part * rate)
+
+
+@pytest.mark.parametrize("refine_start, downscale, most, rows", [
+    (0.5, 1, 512, 64), (0.6, 1, 512, 16), (0.5, 2, 512, 32), (0.5, 4, 512, 16), (0.5, 1, 63, 32)])
+def test_environment_gets_the_rows_that_photographs_tell_apart(dataset, monkeypatch, refine_start, downscale, most, rows):
+    """A mirror ball of 3/8 of 83 pixels is seen over 49 of them along a meridian."""
+    monkeypatch.setattr(fit_module, "_MOST_ROWS", most)
+    settings = replace(SETTINGS, refine_start=refine_start, stages=(Stage(1.0, downscale, 1),), indirect="none")
+    fit = Fit(dataset, model(), settings, 1.0, Shading("split_sum"))
+    fit.step_number = 19  # of 40
+    fit.step()
+    assert fit.model["log_environment"].shape == (16, 32, 3)
+    fit.step()
+    assert fit.model["log_environment"].shape == (rows, 2 * rows, 3)
+    resumed = Fit.resume(dataset, settings, *fit.state(), shading=Shading("split_sum"))
+    before = resumed.model.numpy("log_environment")
+    resumed.step()
+    moved = np.abs(resumed.model.numpy("log_environment") - before).max()
+    assert before.shape[0] == rows and 0 < moved < 0.1
+
+
+def test_a_finer_environment_goes_on_with_the_moments_that_it_would_have():
+    """Those of Adam after a constant derivative: itself and its square."""
+    theta, phi = np.meshgrid(np.linspace(0.2, np.pi - 0.2, 1500), (np.arange(3000) + 0.5) / 3000 * 2 * np.pi, indexing="ij")
+    d = mi.Vector3f(*(x.ravel() for x in (np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi))))
+    learned, seen = model(), []
+    for _ in range(2):
+        logarithm = learned["log_environment"]
+        dr.enable_grad(logarithm)
+        radiance = learned.environment().unfiltered().eval(d)
+        dr.backward(dr.mean(dr.sum(radiance * dr.square(1.5 + d.x * mi.Color3f(0.1, 0.3, 0.5)))))
+        gradient = dr.grad(logarithm).numpy()
+        t, m, v, _ = learned.optimizer.state["log_environment"][3]
+        seen.append((gradient, m.numpy().reshape(gradient.shape), v.numpy().reshape(gradient.shape), int(np.ravel(t)[0])))
+        learned._set_moments("log_environment", mi.UInt32(7), lanes(gradient), lanes(gradient**2))
+        learned.refine_environment()
+    (_, _, _, before), (gradient, m, v, after) = seen
+    inner = slice(4, -4)  # no lookups near the poles
+    np.testing.assert_allclose(m[inner], gradient[inner], rtol=0.06)
+    np.testing.assert_allclose(v[inner], gradient[inner] ** 2, rtol=0.12)
+    assert (before, after) == (0, 7)
 
 
 @pytest.mark.parametrize("where, opacity", [("hull", 0.7), ("points", 0.7), ("anywhere", 0.1)])

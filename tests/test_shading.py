@@ -92,6 +92,19 @@ def test_environment_equals_the_envmap_emitter():
     assert np.allclose(environment.filtered().eval(d).numpy(), emitter.eval(si).numpy(), atol=2e-4)
 
 
+def test_a_finer_environment_is_the_same():
+    """Its texels are what Mitsuba's emitter shows there. (At the poles all texels of a row lie in one direction.)"""
+    texels = np.random.default_rng(3).uniform(0, 1, (16, 32, 3)).astype(np.float32)
+    finer = Environment(mi.TensorXf(texels), np.eye(3)).finer().texels.numpy()
+    assert finer.shape == (32, 64, 3)
+    theta, phi = np.meshgrid(np.pi * np.arange(32) / 31, 2 * np.pi * (np.arange(64) + 0.5) / 64, indexing="ij")
+    d = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], -1)[1:-1]
+    si = dr.zeros(mi.SurfaceInteraction3f, d.size // 3)
+    si.wi = -vector(d.reshape(-1, 3))
+    shown = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(texels)}).eval(si).numpy().T
+    np.testing.assert_allclose(finer[1:-1], shown.reshape(d.shape), atol=2e-4)
+
+
 @pytest.mark.parametrize("entry", [5, 15, 24])
 def test_gradients_equal_finite_differences(entry):
     """Of the shaded image in the environment and every field. All roughness lies in the middle between two ``entry`` of the

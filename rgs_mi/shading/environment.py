@@ -63,6 +63,14 @@ class Environment:
         mirror = _prefilter.Prefilter(self.size, (self.size,), ())
         return FilteredEnvironment(_prefilter.apply(self.texels.array, mirror), mirror, self)
 
+    def finer(self) -> "Environment":
+        """The same on twice as many rows and columns."""
+        rows, columns = (2 * size for size in self.size)
+        index = dr.arange(mi.UInt32, rows * columns)
+        longitude = (mi.Float(index % columns) + 0.5) / columns
+        radiance = self.unfiltered()._level(longitude, mi.Float(index // columns) / (rows - 1), mi.UInt32(0))
+        return Environment(mi.TensorXf(dr.ravel(radiance), (rows, columns, 3)), self.rotation)
+
     def emitter(self):
         """Mitsuba's own `envmap` of the same radiance, for its sampling."""
         to_world = np.eye(4)
