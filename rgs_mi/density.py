@@ -49,7 +49,7 @@ def densify(model, gradients: Gradients, extent: float | np.ndarray, settings, r
 
     hot = np.flatnonzero(keep & (gradient > settings.threshold))
     room = max(0, budget - int(keep.sum()))
-    hot = hot[np.argsort(-gradient[hot], kind="stable")][:room]
+    hot = np.sort(hot[np.argsort(-gradient[hot], kind="stable")][:room])
     large = largest > settings.dense * extent
     split, clone = hot[large[hot]], hot[~large[hot]]
 
@@ -60,10 +60,12 @@ def densify(model, gradients: Gradients, extent: float | np.ndarray, settings, r
     changes["fresh"] = np.arange(len(index)) >= len(stay)
 
     # Both halves of a split are drawn from the parent; they lie in its plane, with the normals it has where they are.
+    # Each surfel has its own draw: one that is split in this run and not in the next changes nothing for the others.
     parents = np.isin(stay, split)
     halves = np.concatenate([np.flatnonzero(parents), np.arange(len(stay) + len(clone), len(index))])
     (t_u, t_v), slopes = ([v.numpy().T[index[halves]] for v in pair] for pair in _tangents(model))
-    u, v = rng.normal(size=(len(halves), 2)).astype(np.float32).T[..., None]
+    draws = rng.normal(size=(2, len(model), 2)).astype(np.float32)
+    u, v = np.concatenate([draws[0, stay[parents]], draws[1, split]]).T[..., None]
     s_u, s_v = scales[index[halves], :, None].transpose(1, 0, 2)
     changes["centers"][halves] += u * s_u * t_u + v * s_v * t_v
     changes["delta_normal"][halves] += u * slopes[0] + v * slopes[1]
