@@ -29,7 +29,7 @@ _RATES = {"centers": "centers", "rotations": "rotations", "log_scales": "scales"
           ENVIRONMENT: "environment", SHADER: "shader"}
 _NORMALS, _HELD = ("rotations", "delta_normal", "curvature"), 0.1  # the part of their rates that they have at first
 _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
-# A mirror ball, of 3/8 of the picture, turns what its middle reflects by 2/r a pixel: it has a row for each at π r/2 rows
+# A mirror ball, its radius r 3/8 of the picture, turns what its middle reflects by 2/r a pixel: π r/2 rows are told apart
 _ROWS_A_PIXEL, _MOST_ROWS = 3 * np.pi / 16, 512
 _DIVERGED = 10  # steps in a row without a finite error
 
@@ -272,8 +272,8 @@ class Fit:
         return chosen
 
     def _refine_environment(self):
-        """Double the environment's rows, up to `_MOST_ROWS`, while photographs tell more apart."""
-        if self.progress < self.settings.refine_start:
+        """Double the rows of an environment that is learned, up to `_MOST_ROWS`, while photographs tell more apart."""
+        if self.progress < self.settings.refine_start or not any(self.settings.rates.environment):
             return
         rows = self.model[ENVIRONMENT].shape[0]
         while 2 * rows <= _MOST_ROWS and np.sqrt(2) * rows < _ROWS_A_PIXEL * self.pixels:

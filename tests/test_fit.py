@@ -284,6 +284,13 @@ def test_rates_fall_to_zero_in_the_end(dataset, cooldown, parts):
             assert fit.model.optimizer.learning_rate(name) == pytest.approx(part * rate)
 
 
+def test_a_light_that_is_given_keeps_its_rows(dataset):
+    given = replace(SETTINGS, refine_start=0.0, rates=Rates(environment=(0.0, 0.0)))
+    fit = Fit(dataset, model(), given, 1.0, Shading("split_sum"))
+    fit.step()
+    np.testing.assert_array_equal(fit.model.numpy("log_environment"), model().numpy("log_environment"))
+
+
 @pytest.mark.parametrize("refine_start, downscale, most, rows", [
     (0.5, 1, 512, 64), (0.6, 1, 512, 16), (0.5, 2, 512, 32), (0.5, 4, 512, 16), (0.5, 1, 63, 32)])
 def test_environment_gets_the_rows_that_photographs_tell_apart(dataset, monkeypatch, refine_start, downscale, most, rows):
