@@ -107,7 +107,7 @@ class Settings:
     # half as far from the point that the cameras look at as the nearest of them
     box: tuple[float, float, float, float, float, float] | None = None
     reflective: float = _within(0.9, 0, 1)  # the fraction of a view's foreground, smoothest first, that is reflective
-    # Fraction of the fit from which the environment's rows double, where photographs have the pixels to tell them apart
+    # Fraction of the fit from which a learned environment has the rows that photographs tell apart, by doubling, up to 512
     refine_start: float = _within(0.5, 0, 1)
     shader: Literal["identity", "mlp"] = "identity"  # f_φ of C = C_d + f_φ(C_s): nothing, or a tiny network trained along
     indirect: Literal["none", "visibility", "one_bounce"] = "one_bounce"  # what reflected rays that meet surfels bring

@@ -294,7 +294,7 @@ def test_a_light_that_is_given_keeps_its_rows(dataset):
 @pytest.mark.parametrize("refine_start, downscale, most, rows", [
     (0.5, 1, 512, 64), (0.6, 1, 512, 16), (0.5, 2, 512, 32), (0.5, 4, 512, 16), (0.5, 1, 63, 32)])
 def test_environment_gets_the_rows_that_photographs_tell_apart(dataset, monkeypatch, refine_start, downscale, most, rows):
-    """A mirror ball of 3/8 of 83 pixels is seen over 49 of them along a meridian."""
+    """A mirror ball whose radius is 3/8 of 83 pixels has 49 of them from pole to pole (π r/2)."""
     monkeypatch.setattr(fit_module, "_MOST_ROWS", most)
     settings = replace(SETTINGS, refine_start=refine_start, stages=(Stage(1.0, downscale, 1),), indirect="none")
     fit = Fit(dataset, model(), settings, 1.0, Shading("split_sum"))
