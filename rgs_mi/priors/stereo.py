@@ -38,19 +38,21 @@ _FLAT = 1e-4  # variance of grey levels in a window that shows nothing
 
 def carved_hull(views, resolution: int | None = None, quiet: bool = True) -> hull.SignedField:
     """`hull.visual_hull` of ``views``, less what they look through; ``quiet``: no progress. Needs a JIT variant."""
-    field, rough = hull.visual_hulls(views, resolution, min(resolution or _STEPS, _STEPS))
-    vertices, faces, _ = hull.surface(rough)
-    small = [Small.of(view) for view in views]
-    depths = hull.depth_maps(vertices, faces, [s.camera for s in small])
-    radius = float(np.linalg.norm(vertices - vertices.mean(0), axis=1).max())
-    step = _REACH * radius / _LEVELS
-    deeper = []
-    with Progress(quiet=quiet, label="looking below the visual hull") as progress:
+    with Progress(quiet=quiet, label="carving the visual hull") as progress:
+        field, rough = hull.visual_hulls(views, resolution, min(resolution or _STEPS, _STEPS))
+        vertices, faces, _ = hull.surface(rough)
+        small = [Small.of(view) for view in views]
+        depths = hull.depth_maps(vertices, faces, [s.camera for s in small])
+        radius = float(np.linalg.norm(vertices - vertices.mean(0), axis=1).max())
+        step = _REACH * radius / _LEVELS
+        progress.update(0)
+        deeper = []
         for i in range(len(small)):
             deeper.append(sweep(i, small, depths, step))
-            progress.update((i + 1) / len(small), views=i + 1)
-    cut = carve(rough, small, depths, _agreed(small, depths, deeper, step), step)
-    return _least(field, cut)
+            progress.update((i + 1) / (len(small) + 1), views=i + 1)
+        cut = carve(rough, small, depths, _agreed(small, depths, deeper, step), step)
+        progress.update(1)
+        return _least(field, cut)
 
 
 class Small:
