@@ -6,6 +6,8 @@ import sys
 
 import mitsuba as mi
 
+from rgs_mi.core.errors import UserError
+
 _MODULES = ("procedural", "lanes", "surfels", "rgs_deferred", "rgs_path")
 
 
@@ -24,3 +26,38 @@ def register():
     mi.detail.add_variant_callback(_load)
     if mi.variant():
         _load(None, mi.variant())
+
+
+def surfels_of(scene, path):
+    """The scene's one `surfels` shape. Raises: UserError where there is none, or more."""
+    from .surfels import SurfelShape  # of the variant that is active now
+
+    found = [shape for shape in scene.shapes() if isinstance(shape, SurfelShape)]
+    if len(found) != 1:
+        raise UserError(f"{path}: has {len(found)} shapes of type 'surfels': a scene to fit has exactly one")
+    return found[0]
+
+
+def is_deferred(integrator) -> bool:
+    """Whether the integrator is an 'rgs_deferred'."""
+    from .rgs_deferred import DeferredIntegrator
+
+    return isinstance(integrator, DeferredIntegrator)
+
+
+def deferred_of(scene, path):
+    """The scene's integrator. Raises: UserError where it is another than 'rgs_deferred'."""
+    integrator = scene.integrator()
+    if not is_deferred(integrator):
+        raise UserError(f"{path}: its integrator is a {integrator.class_name()}: surfels need 'rgs_deferred'")
+    return integrator
+
+
+def lit_surfels(scene, path):
+    """The scene's `Surfels`, and the `Lighting` by which its integrator shades them (None: diffuse radiance alone).
+
+    Raises: UserError where there are no surfels, more than one shape of them, or another integrator than 'rgs_deferred'.
+    """
+    shape, integrator = surfels_of(scene, path), deferred_of(scene, path)
+    environment = integrator.environment(scene)
+    return shape.surfels, integrator.lighting(scene, shape.surfels, shape.eta, environment, seed=0)

@@ -64,17 +64,16 @@ from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
+from rgs_mi.plugins.surfels import box_of, resolve, surfels_in
 
-from rgs_mi.camera import Camera
-from rgs_mi.errors import UserError
-from rgs_mi.proxies import Proxies
+from rgs_mi.core.camera import Camera
+from rgs_mi.core.errors import UserError
 from rgs_mi.shading import deferred, indirect
 from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.monte_carlo import SAMPLES, MonteCarlo
 from rgs_mi.shading.shader import Shader
 from rgs_mi.shading.split_sum import SplitSum
-
-from .surfels import box_of, resolve, surfels_in
+from rgs_mi.surfels.proxies import Proxies
 
 AOVS = {"depth": "T", "normal": "XYZ", "albedo": "RGB", "roughness": "Y", "metallic": "Y", "alpha": "Y",
         "specular": "RGB", "diffuse": "RGB"}

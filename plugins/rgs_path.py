@@ -30,20 +30,20 @@ a table, shows in a mirror, throws a shadow and receives some. Any BSDF and emit
    - Whether emitters are invisible to the camera (Default: |false|)
 
 A ray meets surfels front to back, and ends on them with the probability of their coverage, on a principled BSDF of their
-mean normal and material, as :monosp:`rgs_deferred` shades a pixel (`rgs_mi.rays`). Rays that leave surfels start above
-their neighbours, by two standard deviations of a typical one: what touches an object that closely throws no shadow on it.
+mean normal and material, as :monosp:`rgs_deferred` shades a pixel (`rgs_mi.surfels.ray_tracing`). Rays that leave surfels
+start above their neighbours, by two standard deviations of a typical one: what touches an object that closely throws no
+shadow on it.
 Of surfels that lie in exactly one plane a ray meets only the first. Renders pictures: nothing is differentiated, fits use
 :monosp:`rgs_deferred`.
 """
 
 import drjit as dr
 import mitsuba as mi
+from rgs_mi.plugins.surfels import box_of, surfels_in
 
-from rgs_mi.errors import UserError
-from rgs_mi.rays import SurfelRays
+from rgs_mi.core.errors import UserError
 from rgs_mi.shading.monte_carlo import SpecularLobe, WholeLobe
-
-from .surfels import box_of, surfels_in
+from rgs_mi.surfels.ray_tracing import SurfelRays
 
 DIFFUSE = ("radiance", "lit")
 _NO_LIMIT = 0xFFFFFFFF

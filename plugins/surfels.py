@@ -2,7 +2,7 @@
 Surfels (:monosp:`surfels`)
 ---------------------------
 
-Flat Gaussians with a principled material (`rgs_mi.surfel.Surfels`), for the integrator :monosp:`rgs_deferred`.
+Flat Gaussians with a principled material (`rgs_mi.surfels.surfels.Surfels`), for the integrator :monosp:`rgs_deferred`.
 
 .. pluginparameters::
 
@@ -44,12 +44,12 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from rgs_mi.box import Box
-from rgs_mi.errors import UserError
-from rgs_mi.ply import read_ply
-from rgs_mi.proxies import corners, quads
+from rgs_mi.core.bounding_box import Box
+from rgs_mi.core.errors import UserError
 from rgs_mi.shading.split_sum import DEFAULT_ETA
-from rgs_mi.surfel import CHANNELS, Surfels
+from rgs_mi.surfels.ply import read_ply
+from rgs_mi.surfels.proxies import corners, quads
+from rgs_mi.surfels.surfels import CHANNELS, Surfels
 
 EXTENT = 3.0  # half the width of a proxy, in standard deviations
 GEOMETRY = ("centers", "rotations", "scales")

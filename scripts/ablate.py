@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 import rgs_mi
-from rgs_mi.errors import listed, run_main
+from rgs_mi.core.errors import listed, run_main
 
 _SCENES = Path(__file__).parents[1] / "scenes"
 
@@ -17,7 +17,7 @@ def main():
                         help="a folder of scenes to path-trace, or of captures (default: scenes/targets)")
     parser.add_argument("--scenes", type=listed(), metavar="A,B", help="these only")
     parser.add_argument("--variants", type=listed(), metavar="A,B", help="these only: rows of the table in "
-                        "rgs_mi/ablate.py, or presets")
+                        "rgs_mi/commands/ablate.py, or presets")
     parser.add_argument("--minutes", type=float, help="plan each fit to end within this time")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="A.B=VALUE",
                         help="one setting of all fits")
@@ -30,7 +30,7 @@ def main():
     args = parser.parse_args()
 
     rgs_mi.set_variant(args.variant)
-    from rgs_mi.ablate import ablate
+    from rgs_mi.commands.ablate import ablate
 
     failed = ablate(args.suite, _SCENES / "object.xml", scenes=args.scenes, variants=args.variants, minutes=args.minutes,
                     overrides=args.overrides, seeds=args.seeds, out=args.out, quiet=args.quiet)

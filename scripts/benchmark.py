@@ -5,7 +5,7 @@ import argparse
 from pathlib import Path
 
 import rgs_mi
-from rgs_mi.errors import listed, run_main
+from rgs_mi.core.errors import listed, run_main
 
 _SCENES = Path(__file__).parents[1] / "scenes"
 _OBJECT = _SCENES / "object.xml"
@@ -47,12 +47,12 @@ def main():
 
     rgs_mi.set_variant(args.variant)
     if args.command == "suite":
-        from rgs_mi.suite import fit_suite
+        from rgs_mi.commands.suite import fit_suite
 
         failed = fit_suite(args.root, _OBJECT, scenes=args.scenes, config=args.config, minutes=args.minutes,
                            overrides=args.overrides, workers=args.workers, out=args.out, quiet=args.quiet)
         return 1 if failed else 0
-    from rgs_mi import benchmark
+    from rgs_mi.commands import benchmark
 
     if args.command == "splat":
         benchmark.splat(args.surfels, args.res, args.against, args.rounds)

@@ -5,7 +5,7 @@ import argparse
 from pathlib import Path
 
 import rgs_mi
-from rgs_mi.errors import listed, run_main
+from rgs_mi.core.errors import listed, run_main
 
 
 def main():

@@ -5,7 +5,7 @@ import argparse
 from pathlib import Path
 
 import rgs_mi
-from rgs_mi.errors import run_main
+from rgs_mi.core.errors import run_main
 
 
 def main():
@@ -17,7 +17,7 @@ def main():
     args = parser.parse_args()
 
     rgs_mi.set_variant(args.variant)
-    from rgs_mi.reevaluate import reevaluate
+    from rgs_mi.commands.evaluate import reevaluate
 
     reevaluate(args.run, args.data, args.quiet)
 

@@ -5,7 +5,7 @@ import argparse
 from pathlib import Path
 
 import rgs_mi
-from rgs_mi.errors import run_main
+from rgs_mi.core.errors import run_main
 
 
 def main():
@@ -18,7 +18,7 @@ def main():
     args = parser.parse_args()
 
     rgs_mi.set_variant(args.variant)
-    from rgs_mi.shading.fit_taps import fit_taps
+    from rgs_mi.commands.fit_taps import fit_taps
 
     fit_taps(args.out, args.environments, args.steps, args.seed)
 

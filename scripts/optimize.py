@@ -5,7 +5,7 @@ import argparse
 from pathlib import Path
 
 import rgs_mi
-from rgs_mi.errors import parse_variables, run_main
+from rgs_mi.core.errors import parse_variables, run_main
 
 
 def main():
@@ -28,7 +28,7 @@ def main():
     args = parser.parse_args()
 
     rgs_mi.set_variant(args.variant)
-    from rgs_mi.run import optimize
+    from rgs_mi.commands.optimize import optimize
 
     optimize(args.scene, data=args.data, variables=parse_variables(args.define), config=args.config,
              overrides=args.overrides, minutes=args.minutes, seed=args.seed, out=args.out, resume=args.resume,

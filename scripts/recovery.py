@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import rgs_mi
-from rgs_mi.errors import listed, run_main
+from rgs_mi.core.errors import listed, run_main
 
 
 def main():
@@ -23,7 +23,7 @@ def main():
     args = parser.parse_args()
 
     rgs_mi.set_variant(args.variant)
-    from rgs_mi.recovery import recovery
+    from rgs_mi.commands.recovery import recovery
 
     print(json.dumps(recovery(args.run, args.truth, args.lights, size=args.size, out=args.out, quiet=args.quiet), indent=1))
 

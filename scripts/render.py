@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 import rgs_mi
-from rgs_mi.errors import parse_variables, run_main
+from rgs_mi.core.errors import parse_variables, run_main
 
 
 def main():
@@ -36,7 +36,7 @@ def main():
     args = parser.parse_args()
 
     rgs_mi.set_variant(args.variant)
-    from rgs_mi.render import render_scene
+    from rgs_mi.export.render import render_scene
 
     for path in render_scene(args.scene, variables=parse_variables(args.define), view=args.view, turntable=args.turntable,
                              along=args.path, filmed=args.video, size=args.size, spp=args.spp, out=args.out, aovs=args.aovs,

@@ -5,7 +5,7 @@ import argparse
 from pathlib import Path
 
 import rgs_mi
-from rgs_mi.errors import parse_variables, run_main
+from rgs_mi.core.errors import parse_variables, run_main
 
 
 def main():
@@ -26,7 +26,7 @@ def main():
     args = parser.parse_args()
 
     rgs_mi.set_variant(args.variant)
-    from rgs_mi.truth import render_dataset
+    from rgs_mi.datasets.path_traced import render_dataset
 
     out = render_dataset(args.scene, args.out or Path("data") / args.scene.stem, train=args.train, test=args.test,
                          size=args.size, spp=args.spp, radius=args.radius, variables=parse_variables(args.define),

@@ -9,8 +9,8 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
-from rgs_mi.camera import Camera
-from rgs_mi.color import srgb_decode, srgb_encode
+from rgs_mi.core.camera import Camera
+from rgs_mi.core.color import srgb_decode, srgb_encode
 
 SIZE, FOCAL, PRINCIPAL = (120, 96), (100.0, 94.0), (59.0, 49.5)  # neither square pixels nor a central axis
 POINTS = np.array([[0.3 * np.sin(5 * y + 3 * z), y, z] for y in (-1.2, -0.4, 0.4, 1.2) for z in (-0.9, -0.1, 0.7)])

@@ -1,9 +1,11 @@
 import signal
 
 import pytest
-from runs import end_all, make_inputs
 
 import rgs_mi
+
+from fits import random_photographs
+from runs import end_all, make_inputs
 
 # A shell that starts the tests in the background has them ignore Ctrl-C, which processes that they start would inherit.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -27,3 +29,10 @@ def inputs(tmp_path_factory):
     """(scene to fit, its photographs) of `runs.make_inputs`, which no test changes."""
     rgs_mi.set_variant()
     return make_inputs(tmp_path_factory.mktemp("inputs"))
+
+
+@pytest.fixture(scope="session")
+def dataset():
+    """`fits.random_photographs`, which no test changes."""
+    rgs_mi.set_variant()
+    return random_photographs()

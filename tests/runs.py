@@ -5,6 +5,12 @@ import sys
 import time
 from pathlib import Path
 
+import mitsuba as mi
+import numpy as np
+from PIL import Image
+
+from rgs_mi.fit import losses
+
 ROOT = Path(__file__).parents[1]
 TARGET = """<scene version="3.0.0">
     <integrator type="path"> <boolean name="hide_emitters" value="true"/> </integrator>
@@ -19,7 +25,7 @@ TARGET = """<scene version="3.0.0">
 
 def make_inputs(folder: Path, size=32) -> tuple[Path, Path]:
     """Write a scene to fit (object.xml with a small environment) and photographs into ``folder``: both paths."""
-    from rgs_mi.truth import render_dataset
+    from rgs_mi.datasets.path_traced import render_dataset
 
     (folder / "ball.xml").write_text(TARGET)
     data = render_dataset(folder / "ball.xml", folder / "ball", train=12, test=3, size=size, spp=4, radius=6,
@@ -36,8 +42,19 @@ def make_suite(scene: Path, data: Path, folder: Path, *names) -> tuple[Path, Pat
     return scene, folder
 
 
+SMALL = ["iterations=20", "start.surfels=300", "checkpoint_seconds=0", "stages=[{views: 2}]"]  # fitted in seconds
 PATIENCE = 100  # seconds, on a busy machine
 _started = []
+
+
+def assert_renders_as_written(scene, run):
+    """Mitsuba's images of the exported scene are those that the metrics are of."""
+    for k, sensor in enumerate(scene.sensors()):
+        image = np.array(mi.render(scene, sensor=k))
+        color = mi.Color3f(np.ascontiguousarray(image[..., :3].reshape(-1, 3).T))
+        shown = losses.display(color, mi.Float(image[..., 3].ravel()), 1.0).numpy().T.reshape(*image.shape[:2], 3)
+        written = np.asarray(Image.open(run / "test" / f"{sensor.id()}.png")) / 255
+        assert abs(np.clip(shown, 0, 1) - written).max() < 1 / 255
 
 
 def start(*command, **options) -> subprocess.Popen:

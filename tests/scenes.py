@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from rgs_mi.camera import Camera
-from rgs_mi.surfel import Surfels, rotation_from_normal
+from rgs_mi.core.camera import Camera
+from rgs_mi.surfels.surfels import Surfels, rotation_from_normal
 
 
 def sphere_surfels(n, seed=0, scale=0.6, opacity_shift=1.0, order=1):

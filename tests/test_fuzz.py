@@ -21,6 +21,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from rgs_mi.core.errors import UserError
+from rgs_mi.datasets import load_dataset
+from rgs_mi.fit import checkpoint
+from rgs_mi.priors import files as depth_files
+from rgs_mi.surfels.ply import read_ply, write_ply
+
 from captures import (
     FOCAL,
     PRINCIPAL,
@@ -35,12 +42,6 @@ from captures import (
     write_nero,
     write_png16,
 )
-
-from rgs_mi import checkpoint
-from rgs_mi.errors import UserError
-from rgs_mi.ply import read_ply, write_ply
-from rgs_mi.priors import files as depth_files
-from rgs_mi.views import load_dataset
 
 CASES, SECONDS, MEMORY = 200, 10, 2 << 30
 OPENCV = (*FOCAL, *PRINCIPAL, -0.1, 0.02, 0.01, -0.01)
@@ -238,7 +239,7 @@ def test_files_that_unpack_to_more_than_they_should(tmp_path, monkeypatch):
         write(folder / name)
         with monkeypatch.context() as patch:
             patch.setattr("rgs_mi.priors.files.MAX_PIXELS", 700)
-            patch.setattr("rgs_mi.views.images.MAX_PIXELS", 700)
+            patch.setattr("rgs_mi.datasets.images.MAX_PIXELS", 700)
             with pytest.raises(UserError, match=f"{name} cannot be read as a depth map .*(too large|too many)"):
                 depth_files.load([view], folder)
         assert len(depth_files.load([view], folder)) == 1

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..checkpoint import atomic_file
-from ..errors import UserError
+from ..core.errors import UserError
+from ..core.files import atomic_file
+from ..datasets.types import DepthPrior
 from . import files, hull, stereo, vggt
-from .maps import DepthPrior
 
 __all__ = ["NAMES", "DepthPrior", "depth_priors"]
 

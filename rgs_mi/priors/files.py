@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import UserError
-from ..views.images import MAX_PIXELS, check_size
-from .maps import DepthPrior, outlined, resize
+from ..core.errors import UserError
+from ..datasets.images import MAX_PIXELS, check_size, resize
+from ..datasets.types import DepthPrior
+from .maps import outlined
 
 _ASPECT = 0.05  # how far proportions may be off: estimators round sizes to multiples of 14 or 32
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage, spatial, special
 
-from ..errors import UserError
+from ..core.camera import looked_at
+from ..core.errors import UserError
 
 _EDGE_SIGMA = 0.6  # pixels; small enough that lines one pixel wide stay above one half
 _PIXEL_VARIANCE = 1 / 12  # of the box that an antialiased mask has been averaged over
@@ -146,16 +147,6 @@ def _carve(silhouettes, points: np.ndarray, truncation: float) -> np.ndarray:
 
 
 # ---- The field ----
-
-def looked_at(cameras) -> tuple[np.ndarray, float]:
-    """The point [3] nearest to all optical axes, and the greatest distance of a camera from it (at least 1e-3)."""
-    origins = np.stack([c.origin for c in cameras])
-    axes = np.stack([c.to_world[:3, 2] for c in cameras])
-    away = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [C, 3, 3] projects onto the plane across each axis
-    # Where all axes are parallel the depth is free: the faint pull keeps it near the cameras.
-    pull = 1e-6 * len(cameras) * np.eye(3)
-    centre = np.linalg.solve(away.sum(0) + pull, (away @ origins[:, :, None]).sum((0, 2)) + pull @ origins.mean(0))
-    return centre, max(float(np.linalg.norm(origins - centre, axis=1).max()), 1e-3)
 
 
 def _grid(lower, upper, step) -> tuple[np.ndarray, tuple[int, ...]]:

@@ -15,8 +15,8 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from ..aligned import lanes
-from ..progress import Progress
+from ..core.arrays import lanes
+from ..core.progress import Progress
 from ..splat.project import opaque
 from . import hull
 

@@ -11,9 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..color import display
-from ..errors import UserError
-from .maps import DepthPrior, outlined, resize
+from ..core.color import display
+from ..core.errors import UserError
+from ..datasets.images import resize
+from ..datasets.types import DepthPrior
+from .maps import outlined
 
 HUB = "facebook/VGGT-1B"
 _SIDE, _PATCH = 518, 14  # of the longer side after VGGT's preprocessing, and of a token, in pixels

@@ -2,7 +2,7 @@
 
 from html import escape
 
-from ..page import Html
+from .html import Html
 
 #: name in metrics.json -> label, words of a value, unit
 FIGURES = {

@@ -5,12 +5,12 @@ from html import escape
 import numpy as np
 import yaml
 
-from .. import page
-from ..checkpoint import atomic_file
-from ..config import to_dict
-from ..evaluate import SCORES
-from ..pictures import ERROR_RANGE, NORMAL_RANGE
-from ..settings import Settings
+from ..core.files import atomic_file
+from ..evaluation.evaluate import SCORES
+from ..evaluation.pictures import ERROR_RANGE, NORMAL_RANGE
+from ..settings.config import to_dict
+from ..settings.settings import Settings
+from . import html
 from .figures import FIGURES, cell, label
 
 REPORT = "report.html"
@@ -20,7 +20,7 @@ _OF_VIEW = ("psnr", "ssim", "lpips", "normal_mae_deg")  # figures above a view's
 _SLIDER, _PANEL, _ENVIRONMENT = 640, 300, 1024  # most pixels of a picture's width
 _ENVIRONMENT_WORDS = ("The light that was recovered, latitude by longitude: radiance at an exposure, through sRGB's curve; "
                       "what is brighter than white is clipped.")
-_NOTES = {"error": page.scale("0", f"{ERROR_RANGE:g}"), "normal error": page.scale("0°", f"{NORMAL_RANGE}°")}
+_NOTES = {"error": html.scale("0", f"{ERROR_RANGE:g}"), "normal error": html.scale("0°", f"{NORMAL_RANGE}°")}
 
 
 def write(folder, figures: dict, curves, rows, environment: np.ndarray):
@@ -34,14 +34,14 @@ def write(folder, figures: dict, curves, rows, environment: np.ndarray):
 
     Raises: UserError where the disk is full or the folder can't be written.
     """
-    parts = [*_head(figures), page.heading("The fit"), *_curves(curves), page.heading("Views"), *_views(figures, rows),
-             page.heading("Environment"), page.exposure(_shrunk(environment), _ENVIRONMENT_WORDS)]
+    parts = [*_head(figures), html.heading("The fit"), *_curves(curves), html.heading("Views"), *_views(figures, rows),
+             html.heading("Environment"), html.exposure(_shrunk(environment), _ENVIRONMENT_WORDS)]
     if figures["views"]:
-        parts += [page.heading("Figures of the test views"), _table(figures)]
-    parts += [page.heading("Settings"), page.paragraph("As YAML; what differs from the defaults is marked.", "soft"),
-              page.preformatted(_settings(figures["settings"]), "columns"), page.heading("How it was made"), *_made(figures)]
+        parts += [html.heading("Figures of the test views"), _table(figures)]
+    parts += [html.heading("Settings"), html.paragraph("As YAML; what differs from the defaults is marked.", "soft"),
+              html.preformatted(_settings(figures["settings"]), "columns"), html.heading("How it was made"), *_made(figures)]
     with atomic_file(folder / REPORT) as stream:
-        stream.write(page.page(folder.resolve().name, *parts).encode())
+        stream.write(html.page(folder.resolve().name, *parts).encode())
 
 
 # ---- Figures ----
@@ -51,53 +51,53 @@ def _head(figures):
     words = f"{figures['train_views']} photographs fitted, {figures['test_views']} held out. "
     words += ("Figures are means over the views that were held out." if held_out else
               "Nothing was held out to measure on: no figures of quality, and pictures show views that were fitted.")
-    yield page.paragraph(words, "soft")
+    yield html.paragraph(words, "soft")
     if not figures["finished"]:
-        yield page.paragraph("The fit was stopped before its end.")
+        yield html.paragraph("The fit was stopped before its end.")
     known = [name for name in _TILES if figures[name] is not None]
-    yield page.tiles({FIGURES[name][0]: cell(name, figures[name], unit=True) for name in known})
+    yield html.tiles({FIGURES[name][0]: cell(name, figures[name], unit=True) for name in known})
     if held_out and figures["lpips"] is None:
-        yield page.paragraph(f"LPIPS: {figures['lpips_reason']}", "soft")
+        yield html.paragraph(f"LPIPS: {figures['lpips_reason']}", "soft")
 
 
 def _table(figures):
     names = [name for name in SCORES if figures[name] is not None]
     rows = [[view, *(cell(name, scores[name], f"views/{view}/{name}") for name in names)]
             for view, scores in figures["views"].items()]
-    return page.table(["view", *map(label, names)], rows, mean=["mean", *(cell(name, figures[name]) for name in names)])
+    return html.table(["view", *map(label, names)], rows, mean=["mean", *(cell(name, figures[name]) for name in names)])
 
 
 def _made(figures):
     machine = figures["machine"]
     words = ", ".join(f"{name} {version}" for name, version in figures["versions"].items())
-    yield page.preformatted(figures["command"], "wrap")
-    yield page.paragraph(f"{words}. {machine['system']}, {machine['processor']}, {machine['cpus']} processors, variant "
+    yield html.preformatted(figures["command"], "wrap")
+    yield html.paragraph(f"{words}. {machine['system']}, {machine['processor']}, {machine['cpus']} processors, variant "
                          f"{machine['variant']}.", "soft")
-    yield page.paragraph(page.Html("Beside this page: " + ", ".join(
-        page.link(name, name) for name in ("metrics.json", "curves.csv", "contact_sheet.png", "scene.xml"))), "soft")
+    yield html.paragraph(html.Html("Beside this page: " + ", ".join(
+        html.link(name, name) for name in ("metrics.json", "curves.csv", "contact_sheet.png", "scene.xml"))), "soft")
 
 
 # ---- Curves ----
 
 def _curves(curves):
     if not curves.rows:
-        yield page.paragraph("No steps were recorded.")
+        yield html.paragraph("No steps were recorded.")
         return
     seconds = np.array(curves.column("seconds"))
     time, unit = (seconds / 60, "minutes") if seconds[-1] >= 120 else (seconds, "seconds")
     pixels = curves.column("pixels")
     stages = {f"{pixels[0]} px": 0} | {f"{pixels[k]} px": time[k - 1] for k in range(1, len(pixels))
                                        if pixels[k] != pixels[k - 1]}
-    plot = lambda series, words, **options: page.curves({name: (time, y) for name, y in series.items()}, unit, words,
+    plot = lambda series, words, **options: html.curves({name: (time, y) for name, y in series.items()}, unit, words,
                                                         marks=stages, **options)
-    yield page.group("plots",
+    yield html.group("plots",
                      plot({"of a stretch": curves.column("psnr"), "running mean": _running_mean(curves.column("psnr"))},
                           "PSNR of training views, dB", low=None),
                      plot({name.removeprefix("loss.").replace("_", " "): curves.column(name) for name in curves.losses()},
                           "parts of the loss, weighted", log=True),
                      plot({"surfels": curves.column("surfels")}, "surfels"),
                      plot({"ms": curves.column("ms")}, "milliseconds a step", log=True))
-    yield page.paragraph("Means over stretches of the fit. Dotted: where the photographs' width changes.", "soft")
+    yield html.paragraph("Means over stretches of the fit. Dotted: where the photographs' width changes.", "soft")
 
 
 def _running_mean(values, reach=10):
@@ -112,15 +112,15 @@ def _views(figures, rows):
     for name, panels in rows.items():
         scores = figures["views"].get(name, {})
         words = [f"{FIGURES[k][0]} {cell(k, scores[k], f'views/{name}/{k}', True)}" for k in _OF_VIEW if scores.get(k)]
-        yield page.heading(name, 3)
+        yield html.heading(name, 3)
         if words:
-            yield page.paragraph(page.Html(" · ".join(words)), "soft")
+            yield html.paragraph(html.Html(" · ".join(words)), "soft")
         sides = "photograph", "rendering"
-        slider = page.compare(*(panels[side] for side in sides), sides, f"view {name}", _SLIDER)
-        small = [page.picture(image, kind, f"{kind} of view {name}", _PANEL, _NOTES.get(kind, ""))
+        slider = html.compare(*(panels[side] for side in sides), sides, f"view {name}", _SLIDER)
+        small = [html.picture(image, kind, f"{kind} of view {name}", _PANEL, _NOTES.get(kind, ""))
                  for kind, image in panels.items() if kind not in sides]
-        yield page.group("view", slider, page.group("panels", *small))
-    yield page.paragraph("error: mean absolute difference of display values; normals in world space; depth: near is light; "
+        yield html.group("view", slider, html.group("panels", *small))
+    yield html.paragraph("error: mean absolute difference of display values; normals in world space; depth: near is light; "
                          "diffuse and specular: radiance, clipped.", "soft")
 
 
@@ -133,9 +133,9 @@ def _shrunk(environment):
 
 # ---- Settings ----
 
-def _settings(settings: dict) -> page.Html:
+def _settings(settings: dict) -> html.Html:
     """The settings as YAML, a line each; those that differ from the defaults are marked, with the default beside them."""
-    return page.Html("\n".join(_lines(settings, to_dict(Settings()), "")))
+    return html.Html("\n".join(_lines(settings, to_dict(Settings()), "")))
 
 
 def _lines(tree, defaults, indent):

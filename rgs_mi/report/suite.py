@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import page
-from ..checkpoint import atomic_file
-from ..comparison import FIGURES
-from ..errors import UserError
-from ..views.images import read_image
+from ..core.errors import UserError
+from ..core.files import atomic_file
+from ..datasets.images import read_image
+from . import html
+from .comparison import FIGURES
 from .figures import cell, label
 from .run import REPORT
 
@@ -30,14 +30,14 @@ def write_suite(path, runs, title: str):
     names = [name for name in FIGURES if any(figures.get(name) is not None for _, _, figures, _ in found)]
     rows, bad, done = [], [], []
     for k, (scene, folder, figures, error) in enumerate(found):
-        rows.append([_scene(path, scene, folder, error), page.Html("".join(_thumbnails(folder, scene))),
+        rows.append([_scene(path, scene, folder, error), html.Html("".join(_thumbnails(folder, scene))),
                      *(cell(name, figures.get(name), f"{scene}/{name}") for name in names)])
         (bad.append(k) if error else done.append(figures))
     mean = ["mean", f"{len(done)} of {len(found)}", *(_mean(name, done) for name in names)]
     words = f"{len(done)} of {len(found)} scenes came to an end; figures of quality are of views that were held out."
     with atomic_file(path) as stream:
-        stream.write(page.page(title, page.paragraph(words, "soft"),
-                               page.table(["scene", "photograph, rendering", *map(label, names)], rows, bad, mean)).encode())
+        stream.write(html.page(title, html.paragraph(words, "soft"),
+                               html.table(["scene", "photograph, rendering", *map(label, names)], rows, bad, mean)).encode())
 
 
 def _figures(folder, error):
@@ -56,9 +56,9 @@ def _figures(folder, error):
 def _scene(path, scene, folder, error):
     """The name, a link where the run has a page, and below it what went wrong."""
     report = folder and folder / REPORT
-    words = page.link(scene, Path(os.path.relpath(report, path.parent)).as_posix()) if report and report.exists() else \
+    words = html.link(scene, Path(os.path.relpath(report, path.parent)).as_posix()) if report and report.exists() else \
         escape(scene)
-    return page.Html(words + (f"<small>{escape(error)}</small>" if error else ""))
+    return html.Html(words + (f"<small>{escape(error)}</small>" if error else ""))
 
 
 def _mean(name, done):
@@ -76,4 +76,4 @@ def _thumbnails(folder, scene):
             continue  # what is missing in a row is seen
         width = max(pixels.shape[1] // 3, 1)
         for k, kind in enumerate(("photograph", "rendering")):
-            yield page.thumbnail(pixels[:, k * width:(k + 1) * width, :3], f"{kind} of {scene}", _STORED, _SHOWN)
+            yield html.thumbnail(pixels[:, k * width:(k + 1) * width, :3], f"{kind} of {scene}", _STORED, _SHOWN)

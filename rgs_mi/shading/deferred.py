@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..box import Box
+from ..core.bounding_box import Box
 from ..splat.gbuffer import render_gbuffer
 from ..splat.project import opaque
 from .indirect import Indirect

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import UserError
+from ..core.errors import UserError
 from ..splat.hit import adding
 from . import prefilter as _prefilter
 

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..proxies import Proxies
-from ..surfel import SH_0, Surfels
+from ..surfels.proxies import Proxies
+from ..surfels.surfels import SH_0, Surfels
 from .sequence import points
 
 KINDS = ("none", "visibility", "one_bounce")

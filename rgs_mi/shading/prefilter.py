@@ -18,7 +18,7 @@ import drjit as dr
 import numpy as np
 from scipy import fft
 
-from ..aligned import lanes
+from ..core.arrays import lanes
 from .tables import lobe
 
 #: Roughness of each level and the most rows of its map; None: as the environment. Level 0 is the mirror: no filter.

@@ -19,8 +19,8 @@ import mitsuba as mi
 import numpy as np
 from drjit import nn
 
-from ..checkpoint import atomic_file
-from ..errors import UserError
+from ..core.errors import UserError
+from ..core.files import atomic_file
 
 #: [outputs, inputs] of each layer: two hidden ones of 12.
 SHAPES = ((12, 6), (12, 12), (3, 12))

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..aligned import lanes
+from ..core.arrays import lanes
 from .tables import cell
 
 FILE = "taps.npy"

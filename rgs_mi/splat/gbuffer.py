@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .composite import Layout, composite
-from .lists import lane_lists
+from .intersect import lane_lists
 from .project import project
 from .tiles import Cutoffs
 

@@ -9,7 +9,7 @@ Models are centred at the origin, z up, front towards +x, within a radius of abo
 import functools
 import importlib
 
-from ..errors import UserError
+from ..core.errors import UserError
 
 MODELS = ("ball", "car", "coffee", "helmet", "teapot", "toaster")
 

@@ -9,7 +9,7 @@ import functools
 
 import numpy as np
 
-from ..errors import UserError
+from ..core.errors import UserError
 from .cafe import cafe
 from .kitchen import kitchen
 from .outdoors import city, night

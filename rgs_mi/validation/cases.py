@@ -18,9 +18,9 @@ import mitsuba as mi
 import numpy as np
 
 from .. import targets
-from ..camera import Camera
-from ..errors import UserError
-from ..metrics import relative_error
+from ..core.camera import Camera
+from ..core.errors import UserError
+from ..evaluation.metrics import relative_error
 from ..shading.environment import Environment
 from ..shading.monte_carlo import MonteCarlo
 from ..shading.split_sum import DEFAULT_ETA, SplitSum

@@ -12,11 +12,10 @@ import sys
 
 import numpy as np
 
-from .. import page
-from ..checkpoint import atomic_file
-from ..export import write_exr
-from ..pictures import tone_map
-from ..progress import Progress
+from ..core.color import tone_map
+from ..core.files import atomic_file, write_exr
+from ..core.progress import Progress
+from ..report import html
 from .cases import BOUNDS
 from .checks import checks
 
@@ -65,7 +64,7 @@ def _write_maps(path, r):
 
 
 def _html(results, rows, found) -> str:
-    parts = [page.paragraph(
+    parts = [html.paragraph(
         "Mitsuba's path tracer (two segments: direct light) against rgs_deferred's estimators, on Mitsuba's geometry and "
         "rays. z_passed: the part of all pixels whose difference to monte_carlo is within their standard errors; "
         "z_of_sums: the difference of sums over all pixels in standard errors; split_sum_error: Σ|difference| / Σ truth, "
@@ -76,29 +75,29 @@ def _html(results, rows, found) -> str:
         for r in sphere:
             series.setdefault(r.case.material, {}).setdefault(r.case.roughness, []).append(100 * r.error)
         series = {name: (sorted(values), [np.mean(values[x]) for x in sorted(values)]) for name, values in series.items()}
-        parts += [page.heading("Split-sum's error against roughness, sphere, mean over environments"),
-                  page.curves(series, "roughness", "%", {kind: 100 * b for kind, b in BOUNDS.items()})]
-    parts.append(page.heading("Cases"))
-    parts.append(page.table(list(rows[0]), [list(row.values()) for row in rows],
+        parts += [html.heading("Split-sum's error against roughness, sphere, mean over environments"),
+                  html.curves(series, "roughness", "%", {kind: 100 * b for kind, b in BOUNDS.items()})]
+    parts.append(html.heading("Cases"))
+    parts.append(html.table(list(rows[0]), [list(row.values()) for row in rows],
                             [k for k, row in enumerate(rows) if row["verdict"] != "passes"]))
     if any(r.case.shape == "sphere" and r.error > BOUNDS[r.case.kind] for r in results):
-        parts.append(page.paragraph(
+        parts.append(html.paragraph(
             "Where split_sum is over its bound, what is left is its approximation: three lookups in a filtered environment "
             "for a lobe that is stretched, and cut off at the horizon, before light with hard edges. Finer levels of the "
             "filter do not lower it (docs/findings.md). monte_carlo has no such error."))
-    parts.append(page.heading("Sampler, reciprocity, energy"))
-    parts.append(page.table(("check", "value", "bound"), [(c.name, f"{c.value:.4g}", f"{c.bound:g}") for c in found],
+    parts.append(html.heading("Sampler, reciprocity, energy"))
+    parts.append(html.table(("check", "value", "bound"), [(c.name, f"{c.value:.4g}", f"{c.bound:g}") for c in found],
                             [k for k, c in enumerate(found) if not c.passed]))
-    parts.append(page.heading("Pictures"))
+    parts.append(html.heading("Pictures"))
     key = lambda r: (r.case.shape, r.case.environment, r.case.material)
     for (shape, environment, material), group in itertools.groupby(results, key):
         group = list(group)
         columns = [_column(r) for r in group]
         values = ", ".join(f"{r.case.roughness:g}" for r in group)
-        parts.append(page.figure(np.concatenate(columns, 1), f"{shape} in {environment}, {material}; roughness {values} "
+        parts.append(html.figure(np.concatenate(columns, 1), f"{shape} in {environment}, {material}; roughness {values} "
                                  "from left to right. Rows: path, monte_carlo, split_sum; z from −5 (blue) to 5 (red); "
                                  "split_sum − truth from −0.2 to 0.2", 2))
-    return page.page("Cross-validation with Mitsuba's path tracer", *parts)
+    return html.page("Cross-validation with Mitsuba's path tracer", *parts)
 
 
 def _column(r):

@@ -1,0 +1,105 @@
+"""A run judged again on the photographs that it held out: when LPIPS's weights were installed later, or on another machine.
+What `scripts/evaluate.py` calls.
+
+What is judged is the scene that the run exported, not a checkpoint of the fit: it is what people use and pass on, says by
+itself how it is shaded, and is there when checkpoints are deleted. Both give the same figures, to rounding.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from ..core.camera import Camera
+from ..core.errors import UserError
+from ..core.scene_files import load_scene, spp_of
+from ..datasets import load_dataset
+from ..evaluation import lpips
+from ..evaluation.evaluate import SCORES
+from ..export.mitsuba_scene import SCENE, sensor_id
+from ..fit.curves import Curves
+from ..plugins import lit_surfels
+from ..report import results
+from ..settings.config import completed
+from ..settings.settings import Settings
+from ..shading.environment import Environment
+
+_FACTS = {"finished": bool, "train_seconds": (int, float), "iterations": int, "surfels": int, "parameters": int,
+          "peak_rss_mb": (int, float), "train_views": int, "test_views": int, "settings": dict, "versions": dict,
+          "machine": dict, "command": str, "views": dict}  # what metrics.json must say of the fit
+
+
+def reevaluate(run, data=None, quiet=False) -> dict:
+    """Measure the run in the folder ``run`` again, and write its metrics.json, pictures of test views, contact sheet and
+    report anew. What metrics.json says of the fit stays, and LPIPS where its weights are not installed here; ``evaluated``
+    says where and by what this was measured.
+
+    Args:
+      data: the folder of its photographs (None: where metrics.json says that they were)
+
+    Returns: what metrics.json holds now.
+    Raises: UserError for a folder that holds no run, for photographs of something else, and where a file can't be written.
+    """
+    run = Path(run)
+    saved, curves, path = _saved(run / results.METRICS), Curves.read(run), run / SCENE
+    scene = load_scene(path, {})
+    surfels, lighting = lit_surfels(scene, path)
+    dataset = _photographs(data or saved.get("photographs"), scene, run)
+    mean, scores, rows = results.measure(surfels, lighting, dataset, _background(saved, run), spp_of(scene), run, quiet)
+    if not lpips.installed():
+        _keep_lpips(saved, mean, scores)
+    now = {"photographs": str(dataset.root.resolve()), "evaluated": results.circumstances()}
+    figures = {k: v for k, v in saved.items() if k != "views"} | mean | now | {"views": scores}
+    results.publish(run, figures, curves, rows, Environment.from_emitter(scene.environment()))
+    return figures
+
+
+def _saved(path) -> dict:
+    """What metrics.json holds. Raises: UserError where it is missing, damaged, or of something else."""
+    try:
+        saved = json.loads(path.read_text())
+        wrong = [name for name, kind in _FACTS.items() if not isinstance(saved[name], kind)]
+        wrong += [name for name, scores in saved["views"].items() if not isinstance(scores, dict)]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{path}: missing, damaged, or not of a run ({error}): give the folder that a fit wrote") from error
+    if wrong:
+        raise UserError(f"{path}: '{wrong[0]}' is not what a fit writes there: give the folder that a fit wrote")
+    return saved
+
+
+def _keep_lpips(saved, mean, scores):
+    """Put what was ``saved`` of LPIPS into the figures that were measured."""
+    names = [name for name in SCORES if "lpips" in name]
+    if saved.get("lpips") is not None:
+        mean |= {name: saved.get(name) for name in (*names, "lpips_reason")}
+        for view, figures in scores.items():
+            figures |= {name: saved["views"].get(view, {}).get(name) for name in names}
+
+
+def _background(saved, run):
+    try:
+        background = float(completed(Settings, saved["settings"])["background"])
+    except (AttributeError, TypeError, ValueError):
+        background = np.nan
+    if not 0 <= background <= 1:
+        raise UserError(f"{run / results.METRICS}: its settings have no background from 0 to 1: it is damaged")
+    return background
+
+
+def _photographs(folder, scene, run):
+    """The `Dataset`. Raises: UserError where its views are not those of the scene's sensors."""
+    if not isinstance(folder, str | Path):
+        raise UserError(f"{run / results.METRICS} does not say where the photographs are: give their folder with --data")
+    dataset = load_dataset(folder)
+    views, sensors = results.judged(dataset), scene.sensors()
+    same = [sensor_id(view.name) for view in views] == [sensor.id() for sensor in sensors]
+    if not same or not all(map(_sees_the_same, views, sensors)):
+        raise UserError(f"{folder}: its test views are not those of {run}: give the folder of its photographs with --data")
+    return dataset
+
+
+def _sees_the_same(view, sensor):
+    """Whether a view's camera stands where the sensor does, and has its size."""
+    camera, own = Camera.from_sensor(sensor), view.camera
+    scale = max(1.0, np.linalg.norm(own.origin))
+    return camera.size == tuple(own.size) and np.allclose(camera.to_world, own.to_world, atol=1e-4 * scale)

@@ -1,0 +1,149 @@
+"""Fits of a suite of scenes, each done once and gone on with where it was interrupted: what `ablate` and `suite` share."""
+
+import contextlib
+import csv
+import hashlib
+import io
+import json
+import shutil
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..core.errors import UserError
+from ..datasets import is_capture, looked_for
+from ..fit import checkpoint
+from ..fit.scene import FitScene
+from ..report import results
+from ..report.comparison import DETAILS, FIGURES
+from ..settings.config import completed
+from ..settings.settings import Settings
+from .optimize import optimize
+
+_DIGEST = "photographs.sha256"  # beside or above the fits: what they are of
+
+
+# ---- What there is to do ----
+
+@dataclass(frozen=True)
+class Job:
+    """One fit to the photographs ``data`` of ``scene``, into ``folder``: ``overrides`` over ``config`` (a preset, a file or
+    None), which make ``settings`` (nested dicts); ``variant`` and ``seed`` are what tables call it by. ``asked``: it is to
+    be done now; of the others, what is there is shown."""
+
+    scene: str
+    data: Path
+    variant: str
+    seed: int
+    config: str | None
+    overrides: tuple[str, ...]
+    settings: dict
+    folder: Path
+    asked: bool
+
+    def has(self, saved: dict) -> bool:
+        """Whether the settings ``saved`` with a fit are this job's."""
+        return completed(Settings, saved) == self.settings
+
+    def figures(self) -> dict | None:
+        """metrics.json of the finished fit; None where there is none, or one with other settings."""
+        if not results.finished(self.folder):
+            return None
+        figures = json.loads((self.folder / results.METRICS).read_text())
+        return figures if self.has(figures["settings"]) else None
+
+
+def find_scenes(suite) -> dict[str, Path]:
+    """name -> scene file or capture: the ``*.xml`` in the folder ``suite``, and its subfolders in a layout of `views`.
+
+    Raises: UserError where there are none.
+    """
+    suite = Path(suite)
+    captures = {path.name: path for path in suite.glob("*") if is_capture(path)}
+    found = {path.stem: path for path in suite.glob("*.xml")} | captures
+    if not found:
+        raise UserError(f"{suite} holds neither scenes (*.xml) nor captures (folders with {looked_for()}): "
+                        "give a folder of some")
+    return dict(sorted(found.items()))
+
+
+def check_names(kind, names, there):
+    """Raises: UserError for one of ``names`` (or None) that is not ``there``; ``kind``: what they are, in a word."""
+    for name in names or ():
+        if name not in there:
+            raise UserError(f"no {kind} '{name}': choose from {', '.join(there)}")
+
+
+def budget(minutes) -> list[str]:
+    """The overrides that plan a fit to end within ``minutes``; none for None."""
+    return [f"minutes={minutes}", "iterations=null"] if minutes is not None else []
+
+
+def effort(settings: dict) -> str:
+    """The budget of a fit in words."""
+    return f"{settings['iterations']} steps a fit" if settings["iterations"] else f"{settings['minutes']:g} minutes a fit"
+
+
+# ---- Doing it ----
+
+def photographs(xml, data, quiet):
+    """A scene's photographs, path-traced first where need be: a digest of all, and a few test views to show."""
+    dataset = FitScene.load(xml, data).dataset(quiet)
+    digest = hashlib.sha256()
+    for view in [*dataset.train, *dataset.test]:
+        for part in (view.name.encode(), view.camera.to_world.tobytes(), view.pixels.tobytes()):
+            digest.update(part)
+    return digest.hexdigest(), results.shown(results.judged(dataset))[::2]
+
+
+def check_photographs(folder, digest):
+    """Note what the fits below ``folder`` are of. Raises: UserError where those that are there are of other photographs."""
+    path = folder / _DIGEST
+    if path.is_file() and path.read_text().strip() != digest:
+        raise UserError(f"{folder} holds fits to other photographs: delete it, or choose another --out")
+    with checkpoint.atomic_file(path) as stream:
+        stream.write(f"{digest}\n".encode())
+
+
+def fit(xml, job, quiet):
+    """Do a job, or go on with it. Raises: UserError where it fails, or is stopped."""
+    saved = checkpoint.load_latest(job.folder)
+    resume = saved is not None and not results.finished(job.folder) and job.has(saved[1]["settings"])
+    if saved and not resume:
+        warnings.warn(f"{job.folder} had other settings: starting again", stacklevel=2)
+        shutil.rmtree(job.folder / "checkpoints")
+    with contextlib.redirect_stdout(io.StringIO()):
+        optimize(xml, data=job.data, config=job.config, overrides=job.overrides, out=job.folder, resume=resume, quiet=quiet)
+    if job.figures() is None:
+        raise UserError("stopped before its end: the same command goes on")
+
+
+# ---- What comes out ----
+
+def rows_of(jobs, errors) -> list[dict]:
+    """A row (see `comparison`) for each fit that is there or was asked for; ``errors``: {folder: what went wrong}."""
+    rows = []
+    for job in jobs:
+        error = errors.get(job.folder)
+        figures = None if error else job.figures()
+        if figures or job.asked:
+            status = "failed" if error else "finished" if figures else "missing"
+            rows.append({"scene": job.scene, "variant": job.variant, "seed": job.seed, "status": status}
+                        | {name: figures and figures.get(name) for name in (*FIGURES, *DETAILS)} | {"error": error})
+    return rows
+
+
+def write_tables(out, name, sections, rows, told) -> list[Path]:
+    """Write ``OUT/NAME.md`` (``sections`` of text), ``.csv`` (the ``rows``) and ``.json`` (the rows as ``runs``, and what
+    else is ``told``); returns their paths."""
+    lines = io.StringIO()
+    writer = csv.DictWriter(lines, ("scene", "variant", "seed", "status", *FIGURES, *DETAILS, "error"))
+    writer.writeheader()
+    writer.writerows(rows)
+    paths = []
+    for suffix, text in {"md": "\n\n".join(sections) + "\n", "csv": lines.getvalue(),
+                         "json": json.dumps({"runs": rows} | told, indent=1) + "\n"}.items():
+        paths.append(Path(out) / f"{name}.{suffix}")
+        with checkpoint.atomic_file(paths[-1]) as stream:
+            stream.write(text.encode())
+    return paths

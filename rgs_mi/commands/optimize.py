@@ -1,0 +1,198 @@
+"""A fit from beginning to end: photographs and scene in, a run's folder out. What `scripts/optimize.py` calls."""
+
+import shutil
+import sys
+import time
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..core.bounding_box import Box
+from ..core.errors import UserError
+from ..core.interrupt import GracefulInterrupt
+from ..core.progress import Progress
+from ..fit import checkpoint
+from ..fit.events import Events
+from ..fit.model import Model
+from ..fit.scene import FitScene
+from ..fit.trainer import Fit
+from ..priors import depth_priors
+from ..priors.initialization import initial_points, surroundings
+from ..report import results
+from ..settings.config import completed, to_dict
+from ..settings.settings import Settings
+
+_PRIORS = Path("data") / "priors"  # what is known of depths is kept here, below the current folder
+_ON_SURFACE, _ANYWHERE = 0.7, 0.1  # opacities to start with; where surfels fill space, more would hide what is within
+_SMOOTHING = 0.95  # of the PSNR that the progress line shows
+
+
+def optimize(path, *, data=None, variables=None, config=None, overrides=(), minutes=None, seed=None, out=None,
+             resume=False, quiet=False, tensorboard=False) -> Path:
+    """Fit the scene at ``path`` and write the run's folder, which is returned.
+
+    Args:
+      data, variables: see `FitScene.load`
+      config, overrides, minutes, seed: the settings, each over the former (see `FitScene.settings`)
+      out:     the run's folder (default: runs/NAME)
+      resume:  go on from the newest checkpoint in ``out``
+      tensorboard: write event files into the folder's ``tensorboard``
+
+    Raises: UserError for bad input, a package that is missing, a folder that can't be written, and a fit that diverges.
+    """
+    scene = FitScene.load(path, data, variables)
+    overrides = [*overrides, *([f"minutes={minutes}", "iterations=null"] if minutes is not None else []),
+                 *([f"seed={seed}"] if seed is not None else [])]
+    settings = scene.settings(config, overrides)
+    folder = Path(out) if out else Path("runs") / scene.name
+    saved = _saved(folder, resume)
+    events = Events(folder / "tensorboard", saved[1]["step"] if saved else 0) if tensorboard else None
+    dataset = scene.dataset(quiet)
+    checkpoint.make_folder(folder)
+    fit = _resume(saved, scene, dataset, settings) if saved else start(scene, dataset, settings, quiet)
+    stopped = _loop(fit, folder, quiet, events)
+    results.write(fit, scene, folder, quiet)
+    if stopped:
+        print(f"stopped at {100 * fit.progress:.0f}%; go on with the same command and --resume")
+    return folder
+
+
+# ---- Start ----
+
+def _saved(folder, resume):
+    """The checkpoint to go on from, or None. Raises: UserError where a fresh start would lose an unfinished run."""
+    if resume:
+        saved = checkpoint.load_latest(folder)
+        if saved is None:
+            print(f"{folder} holds no checkpoint: starting from the beginning", file=sys.stderr)
+        return saved
+    if any((folder / "checkpoints").glob("step_*.npz")):
+        if not results.finished(folder):
+            raise UserError(f"{folder} holds an unfinished run: go on with --resume, or choose another --out")
+        shutil.rmtree(folder / "checkpoints")
+    return None
+
+
+def start(scene, dataset, settings, quiet=True) -> Fit:
+    """A fit at its beginning."""
+    begin = settings.start
+    points = initial_points(dataset, begin.surfels, settings.seed, begin.hull, begin.carve, quiet)
+    random = points[1] is None and not (dataset.points is not None and len(dataset.points))
+    opacity = begin.opacity or (_ANYWHERE if random else _ON_SURFACE)
+    shading = _shading(scene, dataset, settings)
+    if shading.box is None:
+        extent = float(np.linalg.norm(points[0] - points[0].mean(0), axis=1).max())
+    else:
+        extent = shading.box.radius
+        points = _with_surroundings(points, dataset, settings)
+    light = scene.environment
+    model = Model.start(*points, light.texels.numpy(), light.rotation, settings.sh_order, settings.seed,
+                        begin.scale, opacity, begin.roughness, settings.shader,
+                        two_sided=None if shading.box is None else True)
+    return Fit(dataset, model, settings, extent, shading, _priors(dataset, settings))
+
+
+def _with_surroundings(points, dataset, settings):
+    """`initial_points` of the object and whatever else photographs show, and those of what lies farther away."""
+    positions, _, colors, spacing = points
+    normals = np.random.default_rng((settings.seed, 2)).normal(size=positions.shape)
+    near = positions, normals / np.linalg.norm(normals, axis=1, keepdims=True), colors, spacing
+    far = surroundings(dataset, settings.start.surroundings, settings.seed)
+    return [np.concatenate(pair) for pair in zip(near, far)]
+
+
+def _shading(scene, dataset, settings):
+    """How the scene is shaded: in the box around the object where photographs have no masks.
+
+    Raises: UserError for a box that is none.
+    """
+    try:
+        box = None if settings.box is None else Box.of(settings.box)
+    except ValueError as error:
+        raise UserError(f"settings: box {list(settings.box)}: {error}") from error
+    if box is None and not any(view.masked for view in dataset.train):
+        box = Box.seen_by([view.camera for view in dataset.train])
+    return replace(scene.shading, box=box)
+
+
+def _priors(dataset, settings):
+    """The depth prior of each training view, or None."""
+    if settings.weights.depth == 0:
+        return None
+    return depth_priors(settings.prior.name, dataset.train, cache=_PRIORS, **settings.prior.options)
+
+
+def _resume(saved, scene, dataset, settings) -> Fit:
+    """The fit of a checkpoint, under ``settings``; tells which differ from those that it was saved with."""
+    arrays, meta = saved
+    if meta["photographs"] != _photographs(dataset):
+        raise UserError(f"{dataset.root}: not the photographs of the checkpoint: give its --data, or another --out")
+    old, new = _flat(completed(Settings, meta["settings"])), _flat(to_dict(settings))
+    changed = [key for key in new if old.get(key) != new[key]]
+    if fixed := [key for key in ("sh_order", "shader") if key in changed]:
+        raise UserError(f"{fixed[0]} is {old[fixed[0]]} in the checkpoint and can't change: choose another --out")
+    if changed:
+        listing = ", ".join(f"{key} {old.get(key)} -> {new[key]}" for key in changed)
+        print(f"settings differ from the checkpoint's, the new ones hold: {listing}", file=sys.stderr)
+    return Fit.resume(dataset, settings, arrays, meta, shading=_shading(scene, dataset, settings),
+                      priors=_priors(dataset, settings))
+
+
+def _photographs(dataset) -> list:
+    """What tells one data set from another: names and sizes of its training views."""
+    return [[view.name, *map(int, view.camera.size)] for view in dataset.train]
+
+
+def _flat(tree, prefix="") -> dict:
+    """{"a": {"b": 1}} as {"a.b": 1}."""
+    flat = {}
+    for key, value in tree.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return flat
+
+
+# ---- Loop ----
+
+def _loop(fit, folder, quiet, events=None) -> bool:
+    """Step until the budget is spent or someone interrupts; returns whether someone did. Begins and ends with a
+    checkpoint: a folder that can't be written is known before the work, not after it."""
+    settings, psnr = fit.settings, None
+    checkpoint.save(folder, *_state(fit, folder))
+    (folder / results.METRICS).unlink(missing_ok=True)  # from here on the run is unfinished
+    saved = time.monotonic()
+    planned = None if settings.iterations else max(0.0, 60 * settings.minutes - fit.elapsed)
+    with GracefulInterrupt() as interrupt, Progress(planned, quiet) as progress:
+        while fit.progress < 1 and not interrupt.requested:
+            before = fit.elapsed
+            recorded = fit.step()
+            if not np.isfinite(fit.psnr):
+                raise _diverged(fit, folder)
+            psnr = fit.psnr if psnr is None else _SMOOTHING * psnr + (1 - _SMOOTHING) * fit.psnr
+            progress.update(fit.progress, psnr=psnr, surfels=len(fit.model), ms=1e3 * (fit.elapsed - before),
+                            pixels=fit.pixels)
+            if events and recorded:
+                events.add(fit.curves.rows[-1])
+            if time.monotonic() - saved > settings.checkpoint_seconds:
+                state = _state(fit, folder)
+                try:
+                    checkpoint.save(folder, *state)
+                except UserError as error:
+                    warnings.warn(f"no checkpoint this time, the fit goes on: {error}", stacklevel=2)
+                saved = time.monotonic()
+        checkpoint.save(folder, *_state(fit, folder))
+    return interrupt.requested
+
+
+def _state(fit, folder):
+    """What a checkpoint holds. Raises: UserError for numbers that are not finite, which must not replace good ones."""
+    arrays, meta = fit.state()
+    if not all(np.isfinite(a).all() for a in arrays.values()):
+        raise _diverged(fit, folder)
+    return arrays, meta | {"settings": to_dict(fit.settings), "photographs": _photographs(fit.dataset)}
+
+
+def _diverged(fit, folder):
+    return UserError(f"the fit diverged at step {fit.step_number} (not a finite number): {folder / 'checkpoints'} has "
+                     "the last good state: go on with --resume and lower rates, e.g. --set rates.centers=[1e-4,1e-5]")

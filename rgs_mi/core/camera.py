@@ -1,0 +1,132 @@
+"""Pinhole cameras: one small value type between data sets, Mitsuba sensors and the splatter.
+
+Frames. World space is whatever the scene uses. Camera space here is the computer-vision one: x right, y down, z along
+the viewing direction, so that depth is z and pixel = focal * (x/z, y/z) + principal point. Mitsuba's own camera space
+(x left, y up, z forward) appears only in `from_sensor` and `to_sensor_dict`.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .errors import UserError
+
+_MITSUBA_TO_CV = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera.
+
+    Attributes
+      to_world:  [4, 4] float64, camera space (x right, y down, z forward) to world space, rigid
+      focal:     (fx, fy) in pixels
+      principal: (cx, cy) in pixels, from the upper left corner of the image; (width/2, height/2) is the centre
+      size:      (width, height) in pixels
+    """
+
+    to_world: np.ndarray
+    focal: tuple[float, float]
+    principal: tuple[float, float]
+    size: tuple[int, int]
+
+    @property
+    def origin(self) -> np.ndarray:
+        """[3] position of the pinhole in world space."""
+        return self.to_world[:3, 3]
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """[3, 3] world-to-camera rotation."""
+        return self.to_world[:3, :3].T
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """World points [N, 3] to pixels [N, 2] and depths [N] (z; pixels are meaningless where it is not positive)."""
+        p = (np.asarray(points) - self.origin) @ self.rotation.T
+        z = p[:, 2]
+        return p[:, :2] / np.where(z == 0, 1e-9, z)[:, None] * self.focal + self.principal, z
+
+    def rays(self) -> np.ndarray:
+        """[H, W, 3] world-space directions through the pixel centres, with unit camera-space z (depth times direction
+        plus origin is the point)."""
+        width, height = self.size
+        x = (np.arange(width) + 0.5 - self.principal[0]) / self.focal[0]
+        y = (np.arange(height) + 0.5 - self.principal[1]) / self.focal[1]
+        d = np.stack([*np.meshgrid(x, y), np.ones((height, width))], -1)
+        return d @ self.rotation
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same camera with another pixel grid over the same image plane."""
+        sx, sy = width / self.size[0], height / self.size[1]
+        return replace(self, focal=(self.focal[0] * sx, self.focal[1] * sy),
+                       principal=(self.principal[0] * sx, self.principal[1] * sy), size=(width, height))
+
+    def subdivided(self, spp: int) -> tuple["Camera", int]:
+        """The same camera with a pixel for each of ``spp`` samples of a pixel, rounded up to a square, and how many of them
+        lie along its side."""
+        side = math.ceil(math.sqrt(spp))
+        return self.resized(*(side * n for n in self.size)), side
+
+    def cropped(self, x: int, y: int, width: int, height: int) -> "Camera":
+        """The same camera, restricted to the window of ``width`` × ``height`` pixels whose corner is pixel (x, y)."""
+        return replace(self, principal=(self.principal[0] - x, self.principal[1] - y), size=(width, height))
+
+    @classmethod
+    def look_at(cls, origin, target, up, fov_x: float, size) -> "Camera":
+        """A camera at ``origin`` that looks at ``target``; ``fov_x`` is the horizontal field of view in degrees."""
+        z = np.subtract(target, origin).astype(float)
+        z /= np.linalg.norm(z)
+        x = np.cross(z, up)
+        x /= np.linalg.norm(x)
+        to_world = np.eye(4)
+        to_world[:3] = np.stack([x, np.cross(z, x), z, np.asarray(origin, float)], 1)
+        focal = 0.5 * size[0] / np.tan(np.radians(fov_x) / 2)
+        return cls(to_world, (focal, focal), (size[0] / 2, size[1] / 2), tuple(size))
+
+    @classmethod
+    def from_sensor(cls, sensor) -> "Camera":
+        """The camera of a Mitsuba `perspective` sensor, over the film's crop window.
+
+        Raises: UserError when the sensor is not a perspective pinhole.
+        """
+        import mitsuba as mi
+
+        if sensor.class_name() != "PerspectiveCamera":
+            raise UserError(f"sensor '{sensor.id()}' is a {sensor.class_name()}: surfels need a 'perspective' sensor")
+        params, film = mi.traverse(sensor), sensor.film()
+        width, height = np.array(film.size()).ravel()
+        crop, offset = np.array(film.crop_size()).ravel(), np.array(film.crop_offset()).ravel()
+        scalar = lambda key: float(np.array(params[key]).ravel()[0])
+        focal = 0.5 * width / np.tan(np.radians(scalar("x_fov")) / 2)
+        # A positive principal point offset shifts the optical centre by that fraction of the film, see the plugin's docs.
+        principal = (width * (0.5 - scalar("principal_point_offset_x")) - offset[0],
+                     height * (0.5 - scalar("principal_point_offset_y")) - offset[1])
+        to_world = np.array(params["to_world"].matrix, np.float64).reshape(4, 4) @ _MITSUBA_TO_CV
+        return cls(to_world, (focal, focal), principal, (int(crop[0]), int(crop[1])))
+
+    def to_sensor_dict(self) -> dict:
+        """A Mitsuba `perspective` sensor (as for ``mi.load_dict``) with this camera's view. Needs square pixels."""
+        import mitsuba as mi
+
+        width, height = self.size
+        return {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f((self.to_world @ _MITSUBA_TO_CV).tolist()),
+            "fov_axis": "x",
+            "fov": float(np.degrees(2 * np.arctan(0.5 * width / self.focal[0]))),
+            "principal_point_offset_x": 0.5 - self.principal[0] / width,
+            "principal_point_offset_y": 0.5 - self.principal[1] / height,
+            "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}},
+        }
+
+
+def looked_at(cameras) -> tuple[np.ndarray, float]:
+    """The point [3] nearest to all optical axes, and the greatest distance of a camera from it (at least 1e-3)."""
+    origins = np.stack([c.origin for c in cameras])
+    axes = np.stack([c.to_world[:3, 2] for c in cameras])
+    away = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [C, 3, 3] projects onto the plane across each axis
+    # Where all axes are parallel the depth is free: the faint pull keeps it near the cameras.
+    pull = 1e-6 * len(cameras) * np.eye(3)
+    centre = np.linalg.solve(away.sum(0) + pull, (away @ origins[:, :, None]).sum((0, 2)) + pull @ origins.mean(0))
+    return centre, max(float(np.linalg.norm(origins - centre, axis=1).max()), 1e-3)

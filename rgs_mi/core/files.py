@@ -1,0 +1,87 @@
+"""Files that are there whole or not at all: a reader never sees half of one."""
+
+import errno
+import os
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from .color import to_8bit
+from .errors import UserError
+
+
+@contextmanager
+def atomic_file(path):
+    """Open a binary file that replaces ``path`` when the block ends, and leaves it untouched when the block raises.
+
+    Raises: UserError where the disk is full or the folder can't be written.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with _explained(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with open(temporary, "wb") as stream:
+                yield stream
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(temporary, path)
+            _sync_folder(path.parent)
+    finally:
+        try:
+            temporary.unlink(missing_ok=True)
+        except OSError:
+            pass  # the folder itself is unusable, which is reported above
+
+
+def make_folder(folder):
+    """Make a run's folder, so that one that can't be is found before anything is computed for it.
+
+    Raises: UserError where it can't be made.
+    """
+    with _explained(folder):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+
+
+@contextmanager
+def _explained(path):
+    """What the system says against writing ``path``, as a `UserError`."""
+    try:
+        yield
+    except OSError as error:
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        remedy = "free some space" if full else "check the folder's permissions and free space"
+        raise UserError(f"{path}: can't be written ({error.strerror or error}): {remedy} or choose another folder, "
+                        "what was there before is untouched") from error
+
+
+def write_png(path, image: np.ndarray):
+    """Write [H, W, 3 or 4] display values in [0, 1] as an 8-bit PNG, whole or not at all."""
+    from PIL import Image
+
+    with atomic_file(path) as stream:
+        Image.fromarray(to_8bit(image)).save(stream, "PNG")
+
+
+def write_exr(path, pixels: np.ndarray, channels=None):
+    """Write [H, W, C] as a float32 EXR, whole or not at all; ``channels`` names them (None: RGB)."""
+    import mitsuba as mi
+
+    formats = mi.Bitmap.PixelFormat
+    pixels = np.ascontiguousarray(pixels, np.float32)
+    bitmap = mi.Bitmap(pixels, formats.MultiChannel, channels) if channels else mi.Bitmap(pixels, formats.RGB)
+    memory = mi.MemoryStream()
+    bitmap.write(memory, mi.Bitmap.FileFormat.OpenEXR)
+    with atomic_file(path) as stream:
+        stream.write(memory.raw_buffer())
+
+
+def _sync_folder(folder):
+    """Make a rename in ``folder`` durable; Windows can neither open a folder nor needs to."""
+    if os.name == "posix":
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)

@@ -1,0 +1,32 @@
+"""Mitsuba scene files in, scenes out; what is wrong with a file in one line."""
+
+import re
+from pathlib import Path
+
+import mitsuba as mi
+
+from .errors import UserError
+
+
+def load_scene(path, variables: dict):
+    """``mi.load_file``; ``variables``: the scene's ``<default>``s to override. Needs an active variant.
+
+    Raises: UserError, in one line, for whatever is wrong with the scene.
+    """
+    if not Path(path).is_file():
+        raise UserError(f"no scene at {path}: check the path")
+    try:
+        return mi.load_file(str(path), **{name: str(value) for name, value in variables.items()})
+    except UserError:
+        raise
+    except Exception as error:  # Mitsuba wraps what a plugin raises, its traceback included
+        text = str(error)
+        if "UserError: " in text:
+            text = text.rpartition("UserError: ")[2]
+        text = " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\] ", "", text).split())
+        raise UserError(f"cannot load {path}: {text}") from error
+
+
+def spp_of(scene) -> int:
+    """Samples per pixel that the scene's first sensor asks for."""
+    return scene.sensors()[0].sampler().sample_count()

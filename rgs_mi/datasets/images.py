@@ -1,0 +1,170 @@
+"""Image files as arrays: photographs, masks and normal maps; PNG and JPEG (8 and 16 bit), OpenEXR."""
+
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from ..core.color import srgb_decode
+from ..core.errors import UserError
+
+EXTENSIONS = (".png", ".exr", ".jpg", ".jpeg")  # in order of preference where a file is named without one
+MAX_PIXELS = 1 << 26  # 8192 x 8192; a header that promises more is damaged or hostile
+_ASPECT = 0.05  # how far proportions may be off: small images round their sizes
+
+
+def read_image(path: Path, where: str) -> tuple[np.ndarray, bool]:
+    """A photograph as `View.pixels`, and whether it has a mask (an alpha channel that is not opaque everywhere).
+
+    16-bit PNGs keep their high bytes. EXR files are linear with premultiplied alpha, as the format has it; ``where``
+    begins the message. Raises: UserError when the file is damaged, empty, too large, or holds NaN or infinity.
+    """
+    pixels, alpha = _decoded(_read_exr if path.suffix.lower() == ".exr" else _read_ldr, path, where)
+    if not alpha:
+        pixels[..., 3] = 255 if pixels.dtype == np.uint8 else 1
+    opaque = pixels[..., 3].min() >= (255 if pixels.dtype == np.uint8 else 1)
+    return pixels, alpha and not bool(opaque)
+
+
+def read_grey(path: Path, where: str) -> np.ndarray:
+    """[H, W] float32 in [0, 1]: the alpha channel of an image where that is not opaque everywhere, else its grey level, as
+    the file encodes it (no sRGB curve), of 16 bits where there are 16. Raises: UserError as `read_image` does."""
+    grey = _decoded(_read_grey, path, where)
+    return grey.astype(np.float32) / np.float32(255 if grey.dtype == np.uint8 else 65535)
+
+
+def with_mask(pixels: np.ndarray, coverage: np.ndarray, where: str) -> tuple[np.ndarray, bool]:
+    """A photograph without alpha [H, W, 4] under a mask [h, w] (values in [0, 1], resized where its size is another), and
+    whether that masks anything. Raises: UserError where the mask's proportions are other than the photograph's."""
+    from PIL import Image
+
+    height, width = pixels.shape[:2]
+    check_proportions(coverage.shape[::-1], (width, height), f"{where}: its mask")
+    if coverage.shape != (height, width):
+        coverage = np.asarray(Image.fromarray(coverage).resize((width, height), Image.Resampling.BOX))
+    pixels[..., 3] = np.rint(255 * coverage) if pixels.dtype == np.uint8 else coverage
+    return pixels, bool((coverage < 1).any())
+
+
+def check_proportions(size: tuple[float, float], photograph: tuple[int, int], what: str):
+    """Raises: UserError where ``what``, of ``size`` (width, height), cannot be a ``photograph`` of another resolution."""
+    if abs(size[0] * photograph[1] / (size[1] * photograph[0]) - 1) > _ASPECT:
+        raise UserError(f"{what} is {size[0]:g} x {size[1]:g}, the photograph {photograph[0]} x {photograph[1]}: both must "
+                        "have the same proportions, neither cropped nor turned")
+
+
+def _decoded(read, path, where):
+    try:
+        return read(path)
+    except Exception as error:  # decoders raise anything from OSError to SyntaxError on damaged files
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise UserError(f"{where}: {path} cannot be read as an image ({reason}): replace the file") from error
+
+
+@contextmanager
+def _opened(path):
+    """A PNG or JPEG of tolerable size, not decoded yet."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        image = Image.open(path, formats=("PNG", "JPEG"))
+    except UnidentifiedImageError as error:
+        raise ValueError("not a PNG or JPEG file") from error
+    with image:
+        check_size(*image.size)
+        yield image
+
+
+def _read_ldr(path: Path) -> tuple[np.ndarray, bool]:
+    """[H, W, 4] uint8 of a PNG or JPEG, and whether it has alpha."""
+    from PIL import Image
+
+    with _opened(path) as image:
+        if image.mode.startswith("I"):  # 16-bit grey
+            image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+        alpha = "A" in image.mode or "transparency" in image.info
+        return np.array(image.convert("RGBA")), alpha
+
+
+def _read_grey(path: Path) -> np.ndarray:
+    """[H, W] uint8 or uint16 of a PNG or JPEG."""
+    with _opened(path) as image:
+        if image.mode.startswith("I"):
+            return np.asarray(image).astype(np.uint16)
+        if "A" in image.mode or "transparency" in image.info:
+            alpha = np.asarray(image.convert("RGBA"))[..., 3]
+            if alpha.min() < 255:
+                return alpha
+        return np.asarray(image.convert("L"))
+
+
+def _read_exr(path: Path) -> tuple[np.ndarray, bool]:
+    """[H, W, 4] float32 of an OpenEXR file with straight alpha, and whether it has alpha."""
+    import OpenEXR
+
+    with OpenEXR.File(str(path), header_only=True) as file:
+        lower, upper = file.header()["dataWindow"]
+        check_size(int(upper[0]) - int(lower[0]) + 1, int(upper[1]) - int(lower[1]) + 1)
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        channels = {name: channel.pixels for name, channel in file.channels().items()}
+    if "Y" in channels:
+        channels = {**dict.fromkeys("RGB", channels["Y"]), **channels}
+    if not {"R", "G", "B"} <= channels.keys():
+        raise ValueError(f"channels {', '.join(sorted(channels))}, but R, G and B are needed")
+    alpha = channels.get("A")
+    pixels = np.stack([channels[c] for c in "RGB"] + [np.ones_like(channels["R"]) if alpha is None else alpha], -1)
+    pixels = np.maximum(pixels.astype(np.float32), 0)
+    if not np.isfinite(pixels).all():
+        raise ValueError("NaN or infinite pixels")
+    a = pixels[..., 3:] = np.minimum(pixels[..., 3:], 1)
+    pixels[..., :3] = np.where(a > 1e-4, pixels[..., :3] / np.maximum(a, 1e-4), 0)
+    return pixels, alpha is not None
+
+
+def check_size(width: int, height: int):
+    """Raises: ValueError for a size that no image has."""
+    if width < 1 or height < 1:
+        raise ValueError("its size is zero")
+    if width * height > MAX_PIXELS:
+        raise ValueError(f"{width} x {height} pixels are too many")
+
+
+def read_normal(path: Path, pixels: np.ndarray, where: str) -> np.ndarray:
+    """[H, W, 3] world-space unit normals that belong to a photograph; 0 where unknown.
+
+    ``_normal.png`` (Shiny Blender) holds n/2 + 1/2 and is known where neither its own alpha is zero nor it is black,
+    which no unit normal is. ``_normal_0001.png`` (NeRF Synthetic) holds n itself, cut to [0, 1]
+    and put through the sRGB curve (measured on lego: planes of its visual hull agree to 1 degree): it is known only
+    where no negative component was lost, that is where its length is still one.
+    """
+    clamped = path.stem.endswith("_0001")
+    image = read_image(path, where)[0]
+    if image.shape != pixels.shape:
+        raise UserError(f"{where}: {path} is {image.shape[1]} x {image.shape[0]}, its photograph "
+                        f"{pixels.shape[1]} x {pixels.shape[0]}: normals need the same size")
+    black = ~image[..., :3].any(-1, keepdims=True)
+    normal = image[..., :3].astype(np.float32) / np.float32(255)
+    normal = srgb_decode(normal) if clamped else 2 * normal - 1
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    known = (np.abs(length - 1) < 0.02) if clamped else (length > 0.1) & ~black & (image[..., 3:] > 0)
+    return np.where(known & (pixels[..., 3:] > 0), normal / np.maximum(length, 0.1), 0).astype(np.float32)
+
+
+def resize(values: np.ndarray, height: int, width: int) -> np.ndarray:
+    """A map [h, w] on another pixel grid over the same image plane: [height, width] float32.
+
+    Bilinear between those of the four neighbours that are known, unknown (NaN) where the nearest one is. A smaller grid
+    takes samples, not means, which would mix the object with what lies behind it.
+    """
+    if values.shape == (height, width):
+        return values.astype(np.float32)
+    known = np.isfinite(values)
+    # Pixel centres are at half integers on both grids.
+    rows, columns = (np.clip((np.arange(n) + 0.5) * (m / n) - 0.5, 0, m - 1)
+                     for n, m in zip((height, width), values.shape))
+    grid = np.meshgrid(rows, columns, indexing="ij")
+    sample = lambda x: ndimage.map_coordinates(x.astype(np.float32), grid, order=1, mode="nearest")
+    weight, total = sample(known), sample(np.where(known, values, 0))
+    nearest = known[np.ix_(np.rint(rows).astype(int), np.rint(columns).astype(int))]
+    return np.where(nearest, total / np.maximum(weight, 0.1), np.float32(np.nan)).astype(np.float32)

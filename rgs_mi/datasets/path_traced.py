@@ -1,0 +1,297 @@
+"""Path-traced truth: any Mitsuba scene becomes a data set in the Blender layout (NeRF Synthetic, Shiny Blender).
+
+    transforms_train.json, transforms_test.json    camera_angle_x (radians), frames[].transform_matrix: camera to world,
+                                                   camera x right, y up, looking along -z
+    train/r_0.png          RGBA, 8 bit sRGB, straight alpha
+    train/r_0.exr          RGBA, half float linear radiance, premultiplied alpha (as EXR has it)
+    train/r_0_normal.png   world-space shading normal * 0.5 + 0.5, alpha = coverage
+    train/r_0_aov.exr      float: Depth.Z (along the viewing axis), Normal.X/Y/Z (world), Albedo.R/G/B, Roughness,
+                           Metallic, Alpha; means over the covered part of a pixel, 0 where nothing is.
+                           Look channels up by name: EXR files keep them in alphabetical order
+    truth.json             what was rendered: a second call with the same settings returns at once, another resumes
+
+The radiance is that of the scene's own integrator: with ``hide_emitters`` the background is transparent. Roughness and
+metallic are those of `principled` BSDFs and 0 elsewhere.
+"""
+
+import hashlib
+import importlib.util
+import json
+import math
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+
+from ..core.camera import Camera
+from ..core.errors import UserError
+from ..core.progress import Progress
+from ..core.scene_files import load_scene
+
+FOV = 39.6                  # degrees, Blender's default camera (0.691 rad)
+MARGIN = 1.02               # keeps the object's bounding sphere off the frame
+TEST_SPP = 4                # times the samples of a training view: noise in a test view counts against every score
+AOV_GRID = 4                # samples per pixel and axis of the geometry pass
+AOV_CHANNELS = ("Depth.Z", "Normal.X", "Normal.Y", "Normal.Z", "Albedo.R", "Albedo.G", "Albedo.B",
+                "Roughness", "Metallic", "Alpha")
+_GOLDEN = math.pi * (3 - math.sqrt(5))
+_CV_TO_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+# ---- Viewpoints ----
+
+def train_directions(count: int, seed: int = 0) -> np.ndarray:
+    """[count, 3] unit directions from the object to the cameras: a Fibonacci lattice from -12 degrees to the zenith."""
+    i = np.arange(count)
+    z = math.sin(math.radians(-12)) + (0.995 - math.sin(math.radians(-12))) * (i + 0.5) / count
+    return _direction(_GOLDEN * i + seed, z)
+
+
+def test_directions(count: int, seed: int = 0) -> np.ndarray:
+    """[count, 3] unit directions on a spiral of three turns that climbs from -6 to 65 degrees."""
+    t = (np.arange(count) + 0.5) / count
+    return _direction(6 * math.pi * t + 0.7 + seed, np.sin(np.radians(-6 + 71 * t)))
+
+
+test_directions.__test__ = False        # a name that pytest would collect
+
+
+def _direction(azimuth, z):
+    r = np.sqrt(1 - z**2)
+    return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], -1)
+
+
+def bounds(scene) -> tuple[np.ndarray, float]:
+    """Centre [3] of the scene's bounding box and the radius of a sphere around it that holds every shape.
+
+    Raises: UserError when the scene holds no geometry.
+    """
+    box = scene.bbox()
+    if not scene.shapes() or not box.valid():
+        raise UserError("the scene has no shapes: nothing to look at")
+    center = np.array(box.center(), float).ravel()
+    return center, max(_farthest(shape, center) for shape in scene.shapes())
+
+
+def _farthest(shape, point: np.ndarray) -> float:
+    """Distance from ``point`` [3] to the farthest point of a shape: exact for meshes and spheres, else of its box."""
+    import mitsuba as mi
+
+    box = shape.bbox()
+    low, high = np.array(box.min, float).ravel(), np.array(box.max, float).ravel()
+    if shape.shape_type() == mi.ShapeType.Sphere:
+        return float(np.linalg.norm((low + high) / 2 - point) + (high - low)[0] / 2)
+    vertices = np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3) if shape.is_mesh() else ()
+    if not len(vertices):
+        return float(np.linalg.norm(np.maximum(np.abs(low - point), np.abs(high - point))))
+    return float(np.linalg.norm(vertices - point, axis=1).max())
+
+
+# ---- One view ----
+
+class Renderer:
+    """A loaded scene and one camera that moves: kernels are compiled for the first view only."""
+
+    def __init__(self, scene, size: int):
+        import mitsuba as mi
+
+        camera = Camera.look_at((1, 0, 0), (0, 0, 0), (0, 0, 1), FOV, (size, size))
+        sensor = camera.to_sensor_dict()
+        sensor["film"] |= {"pixel_format": "rgba", "component_format": "float32", "rfilter": {"type": "gaussian"}}
+        sensor["sampler"] = {"type": "multijitter"}
+        self.scene, self.sensor = scene, mi.load_dict(sensor)
+        self.params = mi.traverse(self.sensor)
+
+    def radiance(self, camera: Camera, spp: int, seed: int) -> np.ndarray:
+        """[H, W, 4] float32 linear radiance, premultiplied, by the scene's integrator."""
+        import mitsuba as mi
+
+        self.params["to_world"] = camera.to_sensor_dict()["to_world"]
+        self.params.update()
+        return np.array(mi.render(self.scene, sensor=self.sensor, spp=spp, seed=seed))
+
+    def aov(self, camera: Camera) -> np.ndarray:
+        """[H, W, 10] float32 maps in the order of `AOV_CHANNELS`, from a regular grid of samples in each pixel."""
+        import drjit as dr
+        import mitsuba as mi
+
+        (width, height), n = camera.size, AOV_GRID
+        index = dr.arange(mi.UInt32, width * height * n * n)
+        pixel, sub = index // (n * n), index % (n * n)
+        x = (pixel % width + (sub % n + 0.5) / n - camera.principal[0]) / camera.focal[0]
+        y = (pixel // width + (sub // n + 0.5) / n - camera.principal[1]) / camera.focal[1]
+        to_world = mi.Matrix3f(camera.to_world[:3, :3].tolist())
+        origin = mi.Point3f(*camera.origin.tolist())
+        dr.make_opaque(to_world, origin)
+        ray = mi.Ray3f(origin, dr.normalize(to_world @ mi.Vector3f(x, y, 1)))
+        si = self.scene.ray_intersect(ray)
+        hit, bsdf = si.is_valid(), si.bsdf(ray)
+        normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n)
+        depth = si.t * dr.dot(to_world @ mi.Vector3f(0, 0, 1), ray.d)
+        albedo = bsdf.eval_diffuse_reflectance(si, hit)
+        scalars = [dr.select(bsdf.has_attribute(k, hit), bsdf.eval_attribute_1(k, si, hit), 0)
+                   for k in ("roughness", "metallic")]
+        values = [dr.select(hit, v, 0) for v in (depth, *normal, *albedo, *scalars, mi.Float(1))]
+        dr.eval(values)         # together: one kernel, rays traced once
+        maps = np.stack([np.array(dr.block_sum(v, n * n)) for v in values], -1) / (n * n)
+        maps[:, :-1] /= np.maximum(maps[:, -1:], 1e-9)
+        maps[:, 1:4] /= np.maximum(np.linalg.norm(maps[:, 1:4], axis=1, keepdims=True), 1e-9)
+        return maps.reshape(height, width, -1)
+
+
+def srgb(linear: np.ndarray) -> np.ndarray:
+    """Linear radiance to sRGB in [0, 1] (IEC 61966-2-1)."""
+    x = np.clip(linear, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def _to_8bit(x: np.ndarray) -> np.ndarray:
+    return np.uint8(np.clip(x, 0, 1) * 255 + 0.5)
+
+
+def _write(path: Path, bitmap):
+    """Write a bitmap so that ``path`` is there whole or not at all."""
+    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
+    try:
+        bitmap.write(str(temporary))
+        os.replace(temporary, path)
+    except (OSError, RuntimeError) as error:
+        temporary.unlink(missing_ok=True)
+        reason = str(error).splitlines()[-1]
+        raise UserError(f"cannot write {path}: {reason}: free some space or choose another folder") from error
+
+
+def _write_view(stem: Path, rgba: np.ndarray, aov: np.ndarray):
+    """The files of one view; the photograph last, since its presence means that the view is complete."""
+    import mitsuba as mi
+
+    alpha = rgba[..., 3:]
+    straight = rgba[..., :3] / np.maximum(alpha, 1e-6)
+    half, formats = mi.Struct.Type.Float16, mi.Bitmap.PixelFormat
+    encoded = _to_8bit(np.concatenate([aov[..., 1:4] * 0.5 + 0.5, aov[..., 9:]], -1)) * (aov[..., 9:] > 0)
+    photograph = _to_8bit(np.concatenate([srgb(straight), alpha], -1))
+    _write(stem.with_name(stem.name + "_aov.exr"), mi.Bitmap(aov, formats.MultiChannel, list(AOV_CHANNELS)))
+    _write(stem.with_name(stem.name + "_normal.png"), mi.Bitmap(encoded, formats.RGBA))
+    _write(stem.with_suffix(".exr"), mi.Bitmap(rgba, formats.RGBA).convert(component_format=half))
+    _write(stem.with_suffix(".png"), mi.Bitmap(photograph, formats.RGBA))
+
+
+# ---- The data set ----
+
+def _digest(path: Path, seen: set) -> str:
+    """A hash of a scene file and of the files that it names, includes followed."""
+    if path in seen:
+        return ""
+    seen.add(path)
+    content = path.read_bytes()
+    parts = [hashlib.sha256(content).hexdigest()]
+    if path.suffix == ".xml":
+        for name in sorted(set(re.findall(r'(?:value|filename)\s*=\s*"([^"]+)"', content.decode(errors="replace")))):
+            if (path.parent / name).is_file():
+                parts.append(_digest((path.parent / name).resolve(), seen))
+    return hashlib.sha256("".join(parts).encode()).hexdigest()
+
+
+def _code_digest() -> str:
+    """A hash of the code that decides what the pictures show."""
+    package = Path(__file__).parents[1]
+    procedural = importlib.util.find_spec("rgs_mi.plugins.procedural").origin
+    files = [Path(__file__), package / "core" / "camera.py", Path(procedural), *sorted((package / "targets").glob("*.py"))]
+    return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()
+
+
+def _prepare(out: Path, key: dict) -> bool:
+    """Make ``out`` ready for a data set with the given key; True when it is already complete.
+
+    Views of other settings are deleted, but only in a folder that a former call has made.
+    """
+    manifest = out / "truth.json"
+    old = None
+    if manifest.is_file():
+        try:
+            old = json.loads(manifest.read_text())
+        except ValueError as error:
+            raise UserError(f"{manifest} is damaged: delete the folder {out} and start again") from error
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UserError(f"{out} exists and is not a data set of render_dataset: choose another folder with --out")
+    if old is not None and old.get("key") == key:
+        return bool(old.get("complete"))
+    if old is not None:
+        for split in ("train", "test"):
+            (out / f"transforms_{split}.json").unlink(missing_ok=True)
+            for file in [*(out / split).glob("r_*"), *(out / split).glob(".r_*")]:
+                file.unlink()
+    try:
+        for split in ("train", "test"):
+            (out / split).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"cannot make the folder {out}: {error.strerror}: choose another with --out") from error
+    _write_json(manifest, {"key": key, "complete": False})
+    return False
+
+
+def _write_json(path: Path, data: dict):
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        temporary.write_text(json.dumps(data, indent=1) + "\n")
+        os.replace(temporary, path)
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}: free some space or choose another folder") from error
+
+
+def _frame(split: str, index: int, camera: Camera) -> dict:
+    return {"file_path": f"./{split}/r_{index}", "transform_matrix": (camera.to_world @ _CV_TO_BLENDER).tolist()}
+
+
+def render_dataset(xml, out, *, train: int = 60, test: int = 20, size: int = 400, spp: int = 25,
+                   radius: float | None = None, variables: dict | None = None, seed: int = 0,
+                   quiet: bool = False) -> Path:
+    """Render a Mitsuba scene into a data set in the Blender layout (see the module), or return the one that is there.
+
+    Args:
+      xml: scene file; variables: its ``<default>``s to override
+      out: folder to write; train, test: numbers of views; size: pixels along the side of the square pictures
+      spp: samples per pixel of the training views; test views take `TEST_SPP` times as many. Rounded up to a grid.
+      radius: distance of the cameras from the centre of the scene's bounding box; None fits the object into the frame
+      seed: turns the cameras around the object and reseeds the sampler
+
+    Returns: ``out`` as a Path. Needs an active variant.
+    Raises: UserError for scenes that do not load or hold nothing, and for folders that can't be written.
+    """
+    xml, out, variables = Path(xml), Path(out), dict(variables or {})
+    for name, value in {"train": train, "test": test, "size": size, "spp": spp}.items():
+        if value < 1:
+            raise UserError(f"{name} is {value}: needs at least 1")
+    if not xml.is_file():
+        raise UserError(f"no scene at {xml}: check the path")
+    key = {"scene": _digest(xml.resolve(), set()), "variables": {k: str(v) for k, v in sorted(variables.items())},
+           "train": train, "test": test, "size": size, "spp": spp, "radius": radius, "seed": seed,
+           "code": _code_digest()}
+    if _prepare(out, key):
+        return out
+
+    scene = load_scene(xml, variables)
+    try:
+        center, extent = bounds(scene)
+    except UserError as error:
+        raise UserError(f"{xml}: {error}") from error
+    distance = radius or MARGIN * extent / math.sin(math.radians(FOV / 2))
+    directions = {"train": train_directions(train, seed), "test": test_directions(test, seed)}
+    cameras = {split: [Camera.look_at(center + distance * d, center, (0, 0, 1), FOV, (size, size)) for d in ds]
+               for split, ds in directions.items()}
+    views = [(split, i, camera) for split, cs in cameras.items() for i, camera in enumerate(cs)]
+    renderer = Renderer(scene, size)
+    with Progress(quiet=quiet, label=f"rendering {xml.name}") as progress:
+        for number, (split, i, camera) in enumerate(views):
+            stem = out / split / f"r_{i}"
+            if not stem.with_suffix(".png").is_file():
+                samples = spp * (TEST_SPP if split == "test" else 1)
+                _write_view(stem, renderer.radiance(camera, samples, seed * len(views) + number), renderer.aov(camera))
+            progress.update((number + 1) / len(views), views=number + 1)
+    for split, cs in cameras.items():
+        frames = [_frame(split, i, camera) for i, camera in enumerate(cs)]
+        _write_json(out / f"transforms_{split}.json", {"camera_angle_x": math.radians(FOV), "frames": frames})
+    _write_json(out / "truth.json", {"key": key, "complete": True})
+    return out
+

@@ -1,0 +1,83 @@
+"""The photographs as a fit looks at them: levels of a pyramid, windows around the object."""
+
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import lanes
+from ..core.color import display
+from .images import resize
+
+_CROP_MARGIN = 8  # pixels of background around the object that training looks at
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """One photograph, or the window of it around the object. ``color``, ``alpha``: display values over the background, and
+    coverage; ``prior``: depth up to scale and shift, NaN where unknown, or None, and whether it is ``inverse``; a lane a
+    pixel. ``size``: (width, height) of the whole photograph."""
+
+    camera: object
+    color: "mi.Color3f"
+    alpha: "mi.Float"
+    prior: "mi.Float | None"
+    inverse: bool
+    size: tuple[int, int]
+
+
+class Photographs:
+    """The training photographs of one pyramid level as the losses want them: display space, over the background, and
+    cropped to windows of one size that hold the object in every view (one size, since each needs its own kernels).
+    ``priors``: a `DepthPrior` a view, or None."""
+
+    def __init__(self, views, downscale, background, priors=None):
+        self.views, self.downscale, self.background, self.priors = views, downscale, background, priors
+        self._images = {}
+        self._windows = _windows(views, downscale)
+
+    def __getitem__(self, i) -> Photograph:
+        """View ``i``."""
+        camera, (x, y, width, height) = self.views[i].camera, self._windows[i]
+        if i not in self._images:
+            whole = self._whole(i)
+            window = whole[y:y + height, x:x + width].transpose(2, 0, 1).reshape(whole.shape[2], -1)
+            # Half precision keeps colours; of depths it would make steps.
+            self._images[i] = window[:4].astype(np.float16), window[4:].copy(), whole.shape[1::-1]
+        color, depth, size = self._images[i]
+        planes = [lanes(plane) for plane in color]
+        return Photograph(camera.resized(*size).cropped(x, y, width, height),
+                          mi.Color3f(*planes[:3]) + self.background * (1 - planes[3]), planes[3],
+                          lanes(depth) if len(depth) else None, bool(self.priors and self.priors[i].inverse), size)
+
+    def _whole(self, i):
+        """[H, W, 4 or 5] of this level: colour, coverage and, where there is one, the prior."""
+        view = self.views[i]
+        whole = _shrink(np.concatenate([display(view.pixels, 0.0), view.alpha[..., None]], 2), self.downscale)
+        if self.priors is None:
+            return whole
+        return np.concatenate([whole, resize(self.priors[i].values, *whole.shape[:2])[..., None]], 2)
+
+
+def _windows(views, downscale):
+    """One (x, y, width, height) a view, in pixels of the level: around the mask, of one size where photographs are."""
+    sizes = [tuple(max(n // downscale, 1) if n >= downscale else n for n in v.camera.size) for v in views]
+    if len(set(sizes)) > 1 or not all(v.masked for v in views):
+        return [(0, 0, *size) for size in sizes]
+    boxes = []
+    for view in views:
+        rows, columns = (np.flatnonzero((view.pixels[..., 3] > 0).any(axis)) for axis in (1, 0))
+        boxes.append([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1])
+    boxes = np.array(boxes) / downscale
+    wanted = (boxes[:, 2:] - boxes[:, :2]).max(0) + 2 * _CROP_MARGIN
+    size = np.minimum(np.ceil(wanted / 8) * 8, sizes[0]).astype(int)
+    corners = np.clip(np.round((boxes[:, :2] + boxes[:, 2:] - size) / 2), 0, sizes[0] - size).astype(int)
+    return [(int(x), int(y), int(size[0]), int(size[1])) for x, y in corners]
+
+
+def _shrink(image, factor):
+    """Mean over factor × factor blocks; the last rows and columns that fill no block are left out."""
+    height, width = (max(n // factor, 1) * factor if n >= factor else n for n in image.shape[:2])
+    if factor == 1 or min(image.shape[:2]) < factor:
+        return image
+    return image[:height, :width].reshape(height // factor, factor, width // factor, factor, -1).mean((1, 3))

@@ -1,0 +1,64 @@
+"""What a capture is: photographs with their cameras, and what is known of their depths."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..core.camera import Camera
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph.
+
+    Attributes
+      name:   file stem, unique within its split
+      camera: its pinhole camera
+      pixels: [H, W, 4] RGBA with straight (not premultiplied) alpha. uint8: sRGB-encoded; float32: linear radiance
+              (HDR). Alpha is 255 or 1 everywhere when the photograph has none.
+      masked: whether the photograph came with an alpha channel or mask
+      normal: [H, W, 3] float32 unit normals in world space (0 where there is none), or None
+      path:   the image file
+    """
+
+    name: str
+    camera: Camera
+    pixels: np.ndarray
+    masked: bool
+    normal: np.ndarray | None
+    path: Path
+
+    @property
+    def alpha(self) -> np.ndarray:
+        """[H, W] float32 coverage in [0, 1]."""
+        alpha = self.pixels[..., 3]
+        return alpha / np.float32(255) if alpha.dtype == np.uint8 else alpha
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A capture. ``train`` is fitted, ``test`` is held out (and only ever looked at); ``points`` are [N, 3] positions
+    and ``point_colors`` [N, 3] linear colours of a sparse reconstruction where the layout has one."""
+
+    train: list[View]
+    test: list[View]
+    points: np.ndarray | None = None
+    point_colors: np.ndarray | None = None
+    root: Path = field(default_factory=Path)
+
+
+@dataclass(frozen=True)
+class DepthPrior:
+    """What a prior knows of one view's depth, up to a scale and a shift of its own.
+
+    Attributes
+      values:     [H, W] float32 at the photograph's size, NaN where unknown: z-depth along the viewing axis, or its inverse.
+                  Their unit is the prior's: only the shape of the map counts (`losses.pearson_depth`)
+      inverse:    whether they are inverse depths, larger where nearer
+      confidence: [H, W] float32, larger where surer, 0 where unknown; in the prior's own unit. None: not told
+    """
+
+    values: np.ndarray
+    inverse: bool = False
+    confidence: np.ndarray | None = None

@@ -1,0 +1,112 @@
+"""How good a fit is: held-out views rendered, compared with their photographs, and timed."""
+
+import time
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import lanes
+from ..core.color import display
+from ..fit import losses
+from ..shading import deferred
+from . import lpips, metrics
+
+#: Figures of one view; the mean over views has the same names.
+SCORES = ("psnr", "ssim", "lpips", "lpips_alex", "normal_mae_deg", "normal_ssim", "normal_lpips")
+
+
+@dataclass
+class Rendering:
+    """A rendered view as NumPy arrays, float32.
+
+      image:  [H, W, 3] display values in [0, 1] over the background, what is compared with the photograph
+      alpha:  [H, W, 1] coverage
+      maps:   name -> [H, W, channels], premultiplied by coverage: color, diffuse, specular (linear radiance), normal
+              (world space, unit length before), base_color, roughness, metallic, depth
+    """
+
+    image: np.ndarray
+    alpha: np.ndarray
+    maps: dict[str, np.ndarray]
+
+
+def render_view(surfels, lighting, camera, background, spp=1) -> Rendering:
+    """Render ``surfels`` under a `Lighting` (None: diffuse only) over the display-space grey level ``background``, with
+    ``spp`` samples per pixel, rounded up to a square: linear radiance and all maps are means over a grid, as those of
+    'rgs_deferred'."""
+    (width, height), (fine, side) = camera.size, camera.subdivided(spp)
+    with dr.suspend_grad():
+        image = deferred.render(surfels, fine, lighting)
+        m = image.gbuffer.all
+        length = dr.norm(m.normal)
+        normal = dr.select(length > 0, m.normal * (m.alpha / length), 0)
+        maps = {"color": image.color, "diffuse": image.diffuse, "specular": image.specular, "normal": normal,
+                "base_color": m.base_color, "roughness": m.roughness, "metallic": m.metallic, "depth": m.depth,
+                "alpha": m.alpha}
+        dr.eval(maps)
+        samples = {k: np.atleast_2d(v.numpy()).T.reshape(height, side, width, side, -1) for k, v in maps.items()}
+        means = {k: v.mean((1, 3)) for k, v in samples.items()}
+        alpha = means.pop("alpha")
+        length = np.linalg.norm(means["normal"], axis=-1, keepdims=True)
+        means["normal"] *= alpha / np.where(length > 0, length, 1)
+        color = mi.Color3f(*(lanes(means["color"][..., k]) for k in range(3)))
+        shown = losses.display(color, lanes(alpha), background).numpy().T.reshape(height, width, 3)
+    return Rendering(np.clip(shown, 0, 1), alpha, means)
+
+
+def photograph(view, background) -> np.ndarray:
+    """[H, W, 3] the photograph of ``view`` as `Rendering.image` has it."""
+    return display(view.pixels, background)
+
+
+def score(view, rendering: Rendering, background) -> dict:
+    """The `SCORES` of one view. ``lpips`` and ``normal_lpips`` are with VGG16, as in the papers that build on 3DGS.
+
+    None: figures of normals where the view has none, and of LPIPS where its weights are not installed or the view is too
+    small for it. Normals are compared as pictures (`metrics.normal_colors`) that are white where the view's are unknown.
+    Raises: UserError where the weights are damaged.
+    """
+    distance = lpips.distance if lpips.installed() else lambda *_: float("nan")
+    pair = rendering.image, photograph(view, background)
+    figures = dict.fromkeys(SCORES) | {
+        "psnr": metrics.psnr(*pair), "ssim": metrics.ssim(*pair),
+        "lpips": _finite(distance(*pair, "vgg")), "lpips_alex": _finite(distance(*pair, "alex"))}
+    if view.normal is not None:
+        pair = _normal_pictures(view, rendering)
+        figures |= {"normal_mae_deg": _finite(metrics.normal_mae_deg(rendering.maps["normal"], view.normal, view.alpha)),
+                    "normal_ssim": metrics.ssim(*pair), "normal_lpips": _finite(distance(*pair, "vgg"))}
+    return figures
+
+
+def _normal_pictures(view, rendering):
+    """The normals of the rendering and the view's, [H, W, 3] each."""
+    unknown = (np.linalg.norm(view.normal, axis=-1) < 0.5) & (view.alpha > 0)
+    alphas = np.where(unknown, 0, [rendering.alpha[..., 0], view.alpha])
+    normals = np.where(unknown[..., None], 0, [rendering.maps["normal"], view.normal * view.alpha[..., None]])
+    return tuple(map(metrics.normal_colors, normals, alphas))
+
+
+def mean_scores(scores: list[dict]) -> dict:
+    """The mean of each figure over the views that have it, None where none has."""
+    known = {name: [s[name] for s in scores if s[name] is not None] for name in SCORES}
+    return {name: float(np.mean(values)) if values else None for name, values in known.items()}
+
+
+def _finite(value):
+    return value if np.isfinite(value) else None
+
+
+def frames_per_second(surfels, lighting, cameras, spp=1, frames=20) -> float:
+    """Views per second with ``spp`` samples per pixel, G-buffer and shading, kernels compiled and the environment filtered
+    beforehand: the median."""
+    seconds, cameras = [], [camera.subdivided(spp)[0] for camera in cameras]
+    with dr.suspend_grad():
+        for k in range(frames + 1):
+            dr.sync_thread()
+            start = time.perf_counter()
+            dr.eval(deferred.render(surfels, cameras[k % len(cameras)], lighting).color)
+            dr.sync_thread()
+            seconds.append(time.perf_counter() - start)
+    return float(1 / np.median(seconds[1:]))

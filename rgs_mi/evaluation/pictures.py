@@ -1,0 +1,122 @@
+"""What people look at: pictures of each test view, panels that take it apart, and one sheet that tells the whole fit."""
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from ..core.color import srgb_encode, to_8bit, tone_map
+from ..core.files import atomic_file, write_exr, write_png
+from . import metrics
+from .evaluate import Rendering, photograph
+
+ERROR_GAIN = 4  # of the absolute error in comparisons
+ERROR_RANGE, NORMAL_RANGE = 0.2, 20  # what the ramp of errors ends at: display values, degrees
+#: Colours of errors, from none to the largest, evenly spaced; from light to dark.
+RAMP = np.array([[255, 255, 255], [250, 214, 122], [235, 130, 56], [184, 51, 69], [84, 18, 74]]) / 255
+_PANEL, _GAP, _MARGIN, _TEXT = 280, 12, 32, 24  # pixels of the contact sheet
+_INK = (60, 60, 60)
+_ON_SHEET = ("photograph", "rendering", "normals", "true normals", "roughness", "metallic", "base color", "diffuse",
+             "specular")
+
+
+def write_view(folder, view, rendering: Rendering, background, gbuffer: bool):
+    """``NAME.png`` (the rendering), ``NAME_compare.png`` (photograph, rendering, `ERROR_GAIN` times the error), and
+    where asked ``NAME_gbuffer.exr`` (linear maps premultiplied by coverage; normals in world space)."""
+    truth = photograph(view, background)
+    error = np.abs(rendering.image - truth) * ERROR_GAIN
+    write_png(folder / f"{view.name}.png", rendering.image)
+    write_png(folder / f"{view.name}_compare.png", np.concatenate([truth, rendering.image, error], 1))
+    if gbuffer:
+        maps = rendering.maps | {"alpha": rendering.alpha}
+        names = [f"{name}.{c}" for name, m in maps.items() for c in
+                 ("Y" if m.shape[-1] == 1 else "XYZ" if name == "normal" else "RGB")]
+        write_exr(folder / f"{view.name}_gbuffer.exr", np.concatenate(list(maps.values()), -1), names)
+
+
+# ---- Panels ----
+
+def panels(view, rendering: Rendering, background) -> dict[str, np.ndarray]:
+    """A view taken apart: name -> [H, W, 3] uint8 over white, all cropped to the object.
+
+    ``photograph``, ``rendering``; ``error`` (mean absolute difference of display values, from 0 to `ERROR_RANGE`);
+    ``normals`` and, where the view has them, ``true normals`` (world space) and ``normal error`` (angle, from 0 to
+    `NORMAL_RANGE`); ``depth`` (along the axis, near is light); ``roughness``, ``metallic``, ``base color``; ``diffuse`` and
+    ``specular`` radiance, clipped.
+    """
+    alpha, maps, truth = rendering.alpha, rendering.maps, photograph(view, background)
+    over_white = lambda premultiplied: premultiplied + (1 - alpha)
+    mean = lambda name: maps[name] / np.maximum(alpha, 1e-6)
+    light = lambda name: over_white(srgb_encode(np.clip(mean(name), 0, 1)) * alpha)
+    images = {"photograph": truth, "rendering": rendering.image,
+              "error": ramp(np.abs(rendering.image - truth).mean(-1) / ERROR_RANGE),
+              "normals": metrics.normal_colors(maps["normal"], alpha[..., 0])}
+    if view.normal is not None:
+        known = np.linalg.norm(view.normal, axis=-1, keepdims=True) > 0.5
+        images["true normals"] = metrics.normal_colors(view.normal * known, known[..., 0])
+        angles = metrics.normal_angles_deg(maps["normal"], view.normal)
+        images["normal error"] = np.where(known, ramp(angles / NORMAL_RANGE), 1)
+    images |= {"depth": over_white(alpha * _nearness(mean("depth"), alpha > 0.5)).repeat(3, -1),
+               "roughness": over_white(maps["roughness"]).repeat(3, -1),
+               "metallic": over_white(maps["metallic"]).repeat(3, -1), "base color": light("base_color"),
+               "diffuse": light("diffuse"), "specular": light("specular")}
+    return crop({name: to_8bit(image) for name, image in images.items()}, view)
+
+
+def ramp(values: np.ndarray) -> np.ndarray:
+    """Values in [0, 1], any shape, as colours of `RAMP` [..., 3]; what is beyond has the last one."""
+    return np.stack([np.interp(values, np.linspace(0, 1, len(RAMP)), channel) for channel in RAMP.T], -1)
+
+
+def _nearness(depth, covered):
+    """0.95 for the nearest that is ``covered``, 0.05 for the farthest."""
+    if not covered.any():
+        return np.ones_like(depth)
+    near, far = np.percentile(depth[covered], (1, 99))
+    return 0.05 + 0.9 * np.clip((far - depth) / max(far - near, 1e-9), 0, 1)
+
+
+def crop(panels, view):
+    """The square around the object where the view has a mask, else the whole."""
+    if not view.masked:
+        return panels
+    y, x = np.nonzero(view.pixels[..., 3])
+    height, width = view.pixels.shape[:2]
+    side = min(height, width, round(1.06 * max(np.ptp(x), np.ptp(y))) + 2)
+    left, top = (int(np.clip((v.min() + v.max() - side) // 2, 0, n - side)) for v, n in ((x, width), (y, height)))
+    return {name: image[top:top + side, left:left + side] for name, image in panels.items()}
+
+
+# ---- The contact sheet ----
+
+def contact_sheet(path, rows, environment: np.ndarray, title: str, lines):
+    """One picture of the fit: a row for each view's `panels` of ``rows``; below them the ``environment``
+    [rows, columns, 3] and beside it ``lines`` of text."""
+    names = [name for name in _ON_SHEET if any(name in row for row in rows)]
+    step, line = _PANEL + _GAP, round(1.6 * _TEXT)
+    heights = [round(_PANEL * image.shape[0] / image.shape[1]) for image in (row["photograph"] for row in rows)]
+    width = 2 * _MARGIN + len(names) * step - _GAP
+    map_height = (width - 2 * _MARGIN) * 3 // 10
+    top = _MARGIN + 4 * line
+    below = top + sum(heights) + len(rows) * _GAP + _MARGIN
+    sheet = Image.new("RGB", (width, below + line + map_height + _MARGIN), "white")
+    draw = ImageDraw.Draw(sheet)
+    small, large = ImageFont.load_default(_TEXT), ImageFont.load_default(1.5 * _TEXT)
+
+    draw.text((_MARGIN, _MARGIN), title, _INK, large)
+    for k, name in enumerate(names):
+        draw.text((_MARGIN + k * step + _PANEL / 2, top - line / 2), name, _INK, small, anchor="mm")
+    y = top
+    for row, height in zip(rows, heights):
+        for k, name in enumerate(names):
+            if name in row:
+                _paste(sheet, row[name], (_MARGIN + k * step, y), (_PANEL, height))
+        y += height + _GAP
+    draw.text((_MARGIN, below + line / 2), "environment", _INK, small, anchor="lm")
+    _paste(sheet, tone_map(environment), (_MARGIN, below + line), (2 * map_height, map_height))
+    for k, text in enumerate(lines):
+        draw.text((2 * map_height + 3 * _MARGIN, below + line + 1.5 * k * line), text, _INK, large)
+    with atomic_file(path) as stream:
+        sheet.save(stream, "PNG")
+
+
+def _paste(sheet, image, corner, size):
+    sheet.paste(Image.fromarray(to_8bit(image)).resize(size, Image.LANCZOS), corner)

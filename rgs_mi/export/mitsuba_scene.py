@@ -1,0 +1,98 @@
+"""A fit as files that Mitsuba loads: surfels, environment, shader, and the scene that puts them together."""
+
+import copy
+import warnings
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+
+from ..core.files import atomic_file, write_exr
+from ..surfels.ply import write_ply
+
+SURFELS, ENVIRONMENT, SHADER, SCENE = "object.ply", "environment.exr", "shader.npz", "scene.xml"
+
+
+def export(folder, scene, surfels, environment, shading, indirect, shader, views, spp=1) -> list[Path]:
+    """Write ``object.ply``, ``environment.exr``, ``shader.npz`` (where ``shader`` is not None, the identity) and
+    ``scene.xml`` into ``folder`` and return their paths.
+
+    The scene is the one that was fitted (a `FitScene`) with the results in place of where the fit started, its
+    ``shading``, ``indirect`` light, and a sensor of ``spp`` samples per pixel for each of ``views``, whose id is the view's
+    name: ``mi.render(mi.load_file("scene.xml"), sensor=i)``.
+    Raises: UserError where the disk is full or the folder can't be written.
+    """
+    folder = Path(folder)
+    write_ply(folder / SURFELS, surfels.numpy())
+    write_exr(folder / ENVIRONMENT, environment.texels.numpy())
+    if shader:
+        shader.save(folder / SHADER)
+    root = _fitted(scene, surfels, environment, {"specular": shading.specular, "diffuse": shading.diffuse,
+                                                 "indirect": indirect, "shader": SHADER if shader else None,
+                                                 "box": shading.box})
+    if any(abs(v.camera.focal[0] / v.camera.focal[1] - 1) > 1e-4 for v in views):
+        warnings.warn(f"{folder / SCENE}: the cameras' pixels are not square, those of its sensors are", stacklevel=2)
+    root.extend(_sensor(view, spp) for view in views)
+    ET.indent(root, "    ")
+    with atomic_file(folder / SCENE) as stream:
+        ET.ElementTree(root).write(stream, encoding="utf-8", xml_declaration=True)
+    return [folder / name for name in (SCENE, SURFELS, ENVIRONMENT, *([SHADER] if shader else []))]
+
+
+def sensor_id(name: str) -> str:
+    """The id of a view's sensor: Mitsuba reads '.' as the path of a parameter."""
+    return name.replace(".", "_")
+
+
+def _fitted(scene, surfels, environment, properties):
+    """The scene's XML with results in place of photographs and of the starting light, with ``properties`` of the integrator
+    (None: its default), and without sensors."""
+    root = copy.deepcopy(scene.root)
+    for sensor in root.findall("sensor"):
+        root.remove(sensor)
+    shape = scene.surfels_element(root)
+    shape.remove(shape.find("*[@name='photographs']"))
+    shape.insert(0, _element("string", "filename", SURFELS))
+    shape.insert(1, _element("boolean", "two_sided", str(surfels.two_sided).lower()))
+    emitter = scene.emitter_element(root)
+    emitter[:] = [_element("string", "filename", ENVIRONMENT), _transform(environment.rotation)]
+    emitter.set("type", "envmap")
+    integrator = scene.integrator_element(root)
+    for name, value in properties.items():
+        for element in integrator.findall(f"*[@name='{name}']"):
+            integrator.remove(element)
+        if value:
+            integrator.append(_element("string", name, value))
+    for default in root.findall("default"):
+        name = default.get("name")
+        default.set("value", scene.variables.get(name, default.get("value")))
+        if f"${name}" not in ET.tostring(root, encoding="unicode"):
+            root.remove(default)
+    return root
+
+
+def _sensor(view, spp):
+    d = view.camera.to_sensor_dict()
+    sensor = ET.Element("sensor", type="perspective", id=sensor_id(view.name))
+    numbers = ("fov", "principal_point_offset_x", "principal_point_offset_y")
+    film = ET.Element("film", type="hdrfilm")
+    film.extend([_element("integer", "width", d["film"]["width"]), _element("integer", "height", d["film"]["height"]),
+                 _element("string", "pixel_format", "rgba"), ET.Element("rfilter", type="box")])
+    sampler = ET.Element("sampler", type="independent")
+    sampler.append(_element("integer", "sample_count", spp))
+    sensor.extend([_transform(np.array(d["to_world"].matrix)), _element("string", "fov_axis", "x"),
+                   *(_element("float", name, f"{d[name]:.9g}") for name in numbers), film, sampler])
+    return sensor
+
+
+def _transform(matrix):
+    """A ``to_world`` from [3, 3] or [4, 4]."""
+    full = np.eye(4)
+    full[:len(matrix), :len(matrix)] = matrix
+    transform = ET.Element("transform", name="to_world")
+    ET.SubElement(transform, "matrix", value=" ".join(f"{v:.9g}" for v in full.ravel()))
+    return transform
+
+
+def _element(tag, name, value):
+    return ET.Element(tag, name=name, value=str(value))

@@ -1,0 +1,71 @@
+"""A loaded scene of surfels under another light, or of another material."""
+
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import tensor
+from ..core.errors import UserError
+from ..plugins import surfels_of
+from ..targets import environments
+
+#: What of the surfels can be set: name -> numbers each has.
+MATERIAL = {"roughness": 1, "metallic": 1, "base_color": 3}
+
+
+def relight(scene, path, envmap=None, rotate=0.0):
+    """Put another ``envmap`` (an image, latitude-longitude, or the name of an environment of the suite; None: as it is) into
+    the ``scene`` that ``path`` was loaded from, in the place and orientation of its own, turned by ``rotate`` degrees about
+    its up axis.
+
+    Raises: UserError for a scene without an environment map, and an image that can't be read.
+    """
+    emitter = scene.environment()
+    if emitter is None or emitter.class_name() != "EnvironmentMapEmitter":
+        raise UserError(f"{path}: has no 'envmap' to put another light in place of")
+    params = mi.traverse(emitter)
+    if envmap is not None:
+        params["data"] = mi.traverse(_load(envmap))["data"]
+        params["scale"] = 1.0
+    turned = mi.ScalarTransform4f().rotate([0, 1, 0], rotate)  # an envmap's up axis is y
+    params["to_world"] = mi.Transform4f(mi.ScalarTransform4f(np.array(params["to_world"].matrix).reshape(4, 4)) @ turned)
+    params.update()
+
+
+def _load(envmap):
+    """An envmap emitter of an image, or of the suite."""
+    if str(envmap) in environments.ENVIRONMENTS:
+        return mi.load_dict({"type": "procedural_envmap", "name": str(envmap)})
+    if not Path(envmap).is_file():
+        raise UserError(f"no environment map at {envmap}: check the path, or name one of the suite's: "
+                        f"{', '.join(sorted(environments.ENVIRONMENTS))}")
+    try:
+        bitmap = mi.Bitmap(str(envmap))
+    except RuntimeError as error:
+        raise UserError(f"{envmap}: can't be read ({str(error).splitlines()[-1]}): needs an EXR or HDR image") from error
+    if not np.isfinite(np.array(bitmap)).all():
+        raise UserError(f"{envmap}: holds NaN or infinite radiance: clean it, or take another")
+    return mi.load_dict({"type": "envmap", "bitmap": bitmap})
+
+
+def edit(scene, path, changes):
+    """Set materials of all surfels: ``changes`` are strings 'roughness=0.1', 'base_color=0.8,0.1,0.1', of `MATERIAL`.
+
+    Raises: UserError for another name, and numbers that are no material.
+    """
+    params = mi.traverse(surfels_of(scene, path))
+    for change in changes:
+        name, _, text = change.partition("=")
+        if name not in MATERIAL:
+            raise UserError(f"--set {change}: unknown material '{name}': choose from {', '.join(MATERIAL)}")
+        try:
+            values = [float(v) for v in text.split(",")]
+        except ValueError as error:
+            raise UserError(f"--set {change}: expected {name}=NUMBER" + ",NUMBER,NUMBER" * (MATERIAL[name] == 3)) from error
+        if len(values) not in (1, MATERIAL[name]) or not all(0 <= v <= 1 for v in values):
+            raise UserError(f"--set {change}: needs {MATERIAL[name]} number(s) from 0 to 1")
+        count = dr.width(params[name].array) // MATERIAL[name]
+        params[name] = tensor(np.broadcast_to(np.float32(values), (count, MATERIAL[name])))
+    params.update()

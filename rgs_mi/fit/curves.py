@@ -1,0 +1,69 @@
+"""How a fit went: what its steps measured, in a few hundred rows over its whole length.
+
+    curves.csv: step, seconds, surfels, pixels (width of the photographs) where a stretch of steps ends; psnr (dB, of the
+                training views), ms (a step) and loss.NAME (each part of the loss, weighted), means over the stretch
+"""
+
+import csv
+import io
+import json
+import math
+
+from ..core.errors import UserError
+from ..core.files import atomic_file
+
+FILE = "curves.csv"
+STRETCHES = 300  # of equal parts of the budget; a fit has that many rows, or one a step
+
+
+class Curves:
+    """``rows``: a dictionary a stretch, oldest first, JSON values; what a checkpoint keeps."""
+
+    def __init__(self, rows=()):
+        self.rows = list(rows)
+        self._stretch = None  # number of the one that has begun
+        self._sums = {}  # name -> sum and count over its steps
+
+    def add(self, progress: float, state: dict, measured: dict) -> bool:
+        """Note a step: ``state`` as it is now, ``measured`` to be averaged (what is not finite is left out).
+        ``progress``: of the fit, in [0, 1]. Returns whether a stretch is complete, and has become the last of the rows."""
+        for name, value in measured.items():
+            if math.isfinite(value):
+                total, count = self._sums.get(name, (0.0, 0))
+                self._sums[name] = total + float(value), count + 1
+        stretch = int(STRETCHES * progress)
+        if stretch == self._stretch:
+            return False
+        self.rows.append(state | {name: total / count for name, (total, count) in self._sums.items()})
+        self._stretch, self._sums = stretch, {}
+        return True
+
+    def write(self, folder):
+        """``FOLDER/curves.csv``. Raises: UserError where the disk is full or the folder can't be written."""
+        text = io.StringIO()
+        names = dict.fromkeys(name for row in self.rows for name in row)
+        writer = csv.DictWriter(text, list(names), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self.rows)
+        with atomic_file(folder / FILE) as stream:
+            stream.write(text.getvalue().encode())
+
+    @classmethod
+    def read(cls, folder) -> "Curves":
+        """What `write` wrote; empty where there is none. Raises: UserError where it is damaged."""
+        path = folder / FILE
+        if not path.is_file():
+            return cls()
+        try:
+            with open(path, newline="") as stream:
+                return cls({k: json.loads(v) for k, v in row.items() if v} for row in csv.DictReader(stream))
+        except (ValueError, TypeError, csv.Error) as error:
+            raise UserError(f"{path}: damaged ({error}): delete it, the report then has no curves") from error
+
+    def column(self, name) -> list:
+        """Its value in each row, NaN where a row has none."""
+        return [row.get(name, math.nan) for row in self.rows]
+
+    def losses(self) -> list[str]:
+        """The columns that are parts of the loss."""
+        return list(dict.fromkeys(name for row in self.rows for name in row if name.startswith("loss.")))

@@ -1,0 +1,48 @@
+"""The rows of `curves.Curves` as TensorBoard's event files, RUN/tensorboard: `scripts/optimize.py --tensorboard`."""
+
+import time
+import warnings
+from pathlib import Path
+
+from ..core.errors import UserError
+
+
+class Events:
+    """Writes into ``folder`` what happens from ``step`` on: 0 replaces what is there, another goes on with it.
+
+    Raises: UserError where tensorboardX is not installed or the folder can't be written.
+    """
+
+    def __init__(self, folder, step: int):
+        try:
+            from tensorboardX.event_file_writer import EventsWriter
+            from tensorboardX.proto.event_pb2 import Event, SessionLog
+            from tensorboardX.proto.summary_pb2 import Summary
+        except ImportError as error:
+            raise UserError("--tensorboard: tensorboardX is not installed: pip install tensorboardX") from error
+        self._event, self._summary, self.folder = Event, Summary, Path(folder)
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if step == 0:
+                for stale in self.folder.glob("events.out.tfevents.*"):
+                    stale.unlink()
+            # not SummaryWriter: its thread dies of a full disk, and who waits for it hangs
+            self._writer = EventsWriter(str(self.folder / "events"), f".{step}")
+        except OSError as error:
+            raise UserError(f"{folder}: can't be written ({error.strerror or error}): check the folder's permissions and "
+                            "free space, or leave out --tensorboard") from error
+        if step > 0:  # what was written after the checkpoint that the fit goes on from no longer counts
+            self._write(step + 1, session_log=SessionLog(status=SessionLog.START))
+
+    def add(self, row: dict):
+        """A row of the curves: a scalar for each of its columns but ``step``. A full disk costs the row, not the fit."""
+        scalars = {name.replace(".", "/"): value for name, value in row.items() if name != "step"}
+        values = [self._summary.Value(tag=name, simple_value=value) for name, value in scalars.items()]
+        self._write(row["step"], summary=self._summary(value=values))
+
+    def _write(self, step, **content):
+        try:
+            self._writer.write_event(self._event(wall_time=time.time(), step=step, **content))
+            self._writer.flush()
+        except OSError as error:
+            warnings.warn(f"{self.folder}: can't be written ({error.strerror or error}), the fit goes on", stacklevel=3)

@@ -1,0 +1,246 @@
+"""Image losses and geometric regularisers, all on Dr.Jit arrays with a lane a pixel (row-major)."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import lanes
+from ..shading.deferred import COVERED
+from ..splat.hit import adding
+from ..splat.project import opaque
+
+SATURATED = 0.995  # display value from which a photograph only says "at least this bright"
+_WINDOW, _SIGMA = 11, 1.5  # SSIM's Gaussian window
+_C1, _C2 = 0.01**2, 0.03**2
+_SLOPE = 4.0  # change of log radiance per radian up to which it counts by its square
+_APART, _BEND = 0.015, 0.015  # of `fairness`: part of the image's width; radians
+_FLAT = 1e-6  # standard deviation of a depth map, in units of its depth, up to which it is constant
+
+
+def srgb(x):
+    """The sRGB curve, continued above one; negative values count as zero."""
+    x = dr.maximum(x, 0)
+    return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * dr.power(dr.maximum(x, 0.0031308), 1 / 2.4) - 0.055)
+
+
+def display(color, alpha, background):
+    """Premultiplied linear ``color`` over ``background`` (a display-space grey level) in display space, as data sets with
+    straight alpha are composited: srgb(color / alpha) alpha + background (1 − alpha)."""
+    covered = alpha > COVERED
+    safe = dr.select(covered, alpha, 1)
+    return dr.select(covered, srgb(color / safe) * alpha, 0) + background * (1 - alpha)
+
+
+class _Blur(dr.CustomOp):
+    """SSIM's Gaussian window over a list of images, zero beyond their edges: symmetric, so it is its own adjoint."""
+
+    def eval(self, channels, size):
+        self.size = size
+        return self._apply(channels)
+
+    def forward(self):
+        self.set_grad_out(self._apply(self.grad_in("channels")))
+
+    def backward(self):
+        self.set_grad_in("channels", self._apply(self.grad_out()))
+
+    def _apply(self, channels):
+        width, height = self.size
+        offsets = np.arange(_WINDOW) - _WINDOW // 2
+        weights = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
+        weights /= weights.sum()
+        index = dr.arange(mi.UInt32, width * height)
+        x, y = mi.Int32(index % width), mi.Int32(index // width)
+        for position, extent, stride in ((x, width, 1), (y, height, width)):
+            dr.eval(channels)
+            out = [mi.Float(0)] * len(channels)
+            for offset, weight in zip(offsets.tolist(), weights.tolist()):
+                inside = (position + offset >= 0) & (position + offset < extent)
+                at = mi.UInt32(mi.Int32(index) + offset * stride)
+                out = [dr.fma(dr.gather(mi.Float, c, at, inside), weight, o) for c, o in zip(channels, out)]
+            channels = out
+        dr.eval(channels)
+        return channels
+
+    def name(self):
+        return "rgs_mi.fit.losses.Blur"
+
+
+def ssim(image, target, size):
+    """Mean structural similarity of two ``mi.Color3f`` images (11 × 11 Gaussian window, σ 1.5), differentiable in the
+    first."""
+    with dr.suspend_grad():
+        blurred = dr.custom(_Blur, [*target, *(target * target)], size)
+    mu_y, yy = mi.Color3f(*blurred[:3]), mi.Color3f(*blurred[3:])
+    blurred = dr.custom(_Blur, [*image, *(image * image), *(image * target)], size)
+    mu_x, xx, xy = (mi.Color3f(*blurred[3 * k: 3 * k + 3]) for k in range(3))
+    var_x, var_y, cov = xx - mu_x * mu_x, yy - mu_y * mu_y, xy - mu_x * mu_y
+    value = ((2 * mu_x * mu_y + _C1) * (2 * cov + _C2)) / ((mu_x * mu_x + mu_y * mu_y + _C1) * (var_x + var_y + _C2))
+    return dr.mean(dr.mean(value))
+
+
+def photometric(image, target, size, dssim):
+    """(1 − λ) L1 + λ (1 − SSIM)/2 with λ = ``dssim`` (3DGS). Where the photograph is saturated a brighter rendering is no
+    error, and a too bright rendering elsewhere still feels its gradient."""
+    image = dr.select(target >= SATURATED, dr.minimum(image, target), image)
+    l1 = dr.mean(dr.mean(dr.abs(image - target)))
+    return (1 - dssim) * l1 + dssim * (1 - ssim(image, target, size)) / 2
+
+
+def mask(alpha, target):
+    """Mean absolute difference of coverage and mask."""
+    return dr.mean(dr.abs(alpha - target))
+
+
+def _interior(gbuffer):
+    """Numbers of the pixels that are covered together with their four neighbours."""
+    width, height = gbuffer.size
+    with dr.suspend_grad():
+        alpha = gbuffer.all.alpha
+        dr.eval(alpha)  # a gather from a packet that is not evaluated yet crashes (Dr.Jit 1.5.0)
+        index = dr.arange(mi.UInt32, width * height)
+        x, y = index % width, index // width
+        inner = (x > 0) & (y > 0) & (x + 1 < width) & (y + 1 < height)
+        for neighbour in (index, index - 1, index + 1, index - width, index + width):
+            inner &= dr.gather(mi.Float, alpha, neighbour, inner) > 0.5
+        return dr.compress(inner)
+
+
+def depth_normal_consistency(gbuffer, camera):
+    """2DGS's regulariser: mean of 1 − n·n_D over the image, with n the rendered normal and n_D that of the surface which
+    the rendered (expected) depth describes, by central differences."""
+    width, height = gbuffer.size
+    index = _interior(gbuffer)
+    if dr.width(index) == 0:
+        return mi.Float(0)
+    R, _, f, principal = opaque(camera)
+
+    def point(i):
+        m = gbuffer.maps(i)
+        z = m.depth / m.alpha
+        return mi.Vector3f((mi.Float(i % width) + 0.5 - principal.x) / f.x * z,
+                           (mi.Float(i // width) + 0.5 - principal.y) / f.y * z, z)
+
+    n_depth = dr.normalize(dr.cross(point(index + width) - point(index - width), point(index + 1) - point(index - 1)))
+    n = dr.normalize(R @ gbuffer.maps(index).normal)
+    return dr.sum(1 - dr.dot(n, n_depth)) / (width * height)
+
+
+def distortion(maps, extent):
+    """2DGS's depth distortion, mean over the image of Σ_ij w_i w_j (t_i − t_j)² = 2 (Σw Σwt² − (Σwt)²), in units of
+    ``extent``², the object's radius: surfels along a ray draw together. ``maps``: all `Maps`."""
+    return dr.mean(2 * (maps.alpha * maps.square - dr.square(maps.depth))) / dr.opaque(mi.Float, float(extent) ** 2)
+
+
+def normal_smoothness(gbuffer, reflective, crease=0.0):
+    """RGS's L_normal: mean squared forward difference of N from pixel to pixel, where both are ``reflective`` (β̂, [H, W]
+    bool, NumPy). With ``crease``, d² counts as d² / (1 + d²/crease²): noise of a few degrees is smoothed, an edge of the
+    object is let be."""
+    width, height = gbuffer.size
+    index = _interior(gbuffer)
+    if dr.width(index) == 0:
+        return mi.Float(0)
+    total, pairs, here = mi.Float(0), mi.Float(0), gbuffer.maps(index).normal
+    mask = lanes(reflective)
+    inside = lambda i: dr.gather(mi.Float, mask, i) > 0
+    for step in (1, width):
+        d2 = dr.squared_norm(gbuffer.maps(index + step).normal - here)
+        counted = inside(index) & inside(index + step)
+        total += dr.sum(dr.select(counted, d2 / (1 + d2 / crease**2) if crease > 0 else d2, 0))
+        pairs += mi.Float(dr.count(counted))
+    return 2 * total / dr.maximum(pairs, 1)
+
+
+def fairness(gbuffer, reflective, corner=(0, 0)):
+    """How fast the curvature of smooth surfaces changes (minimum-variation surfaces, Moreton and Séquin 1992). Where a flat
+    mirror shows each part of the environment to few photographs, they agree with any wobble of it; held-out views don't.
+
+        mean of F d² / (1 + d²/ε²),   d = ‖N(p + s) − 2 N(p) + N(p − s)‖,   F = lerp(0.04, 1, metallic(p))
+
+    over pixels p and steps s, to the right and down, of `_APART` image widths; N: unit normals. What changes by more than
+    ε = `_BEND`, an edge or the end of one, is let be. F, which has no gradient, is what is reflected at normal incidence
+    (metals as if white): it keeps the balance with the photographs, which say the less about normals the less is reflected.
+    All three pixels are ``reflective`` (β̂, [H, W] bool, NumPy). Of every 2 × 2 pixels only the one at ``corner`` (row,
+    column) is a p.
+    """
+    width = gbuffer.size[0]
+    apart = max(1, round(_APART * width))
+    total, count = mi.Float(0), 0
+    for axis, stride in ((1, apart), (0, apart * width)):
+        triple = reflective & np.roll(reflective, apart, axis) & np.roll(reflective, -apart, axis)
+        np.moveaxis(triple, axis, 0)[:apart] = np.moveaxis(triple, axis, 0)[-apart:] = False  # rolled in from the other side
+        chosen = np.zeros_like(triple)
+        chosen[corner[0]::2, corner[1]::2] = triple[corner[0]::2, corner[1]::2]
+        index, step = dr.compress(lanes(chosen) > 0), dr.opaque(mi.UInt32, stride)
+        if dr.width(index) == 0:
+            continue
+        here, ahead, behind = (gbuffer.maps(i) for i in (index, index + step, index - step))
+        n = lambda maps: dr.normalize(maps.normal)
+        d2 = dr.squared_norm(n(ahead) - 2 * n(here) + n(behind))
+        reflectance = dr.lerp(0.04, 1, dr.detach(here.metallic))
+        total += dr.sum(reflectance * d2 / (1 + d2 / _BEND**2))
+        count += dr.width(index)
+    return total / dr.opaque(mi.Float, max(count, 1))
+
+
+def delta_normal(gbuffer):
+    """RGS's L_Δn: mean ‖ΔN‖ over the image, of which ``gbuffer`` has all maps."""
+    length2 = dr.squared_norm(gbuffer.all.delta_normal)
+    nonzero = length2 > 0
+    return dr.sum(dr.select(nonzero, dr.sqrt(dr.select(nonzero, length2, 1)), 0)) / (gbuffer.size[0] * gbuffer.size[1])
+
+
+def pearson_depth(depth, prior, valid, inverse=False):
+    """RGS's L_depth: 1 − r, with r Pearson's correlation of the rendered z-depth and a prior's over the ``valid`` pixels.
+
+    ``depth``, ``prior``: ``mi.Float``, a lane a pixel; ``valid``: ``mi.Bool``, where both are known (pixels where one is not
+    finite never count). ``inverse``: the prior holds inverse depths, which are compared with 1/z (z > 0 where valid).
+    Differentiable in ``depth``. r knows neither scale nor shift of the prior; where one of the two maps is constant, or
+    fewer than two pixels are valid, it isn't defined, and the loss and its gradient are 0.
+    """
+    with dr.suspend_grad():
+        valid = valid & dr.isfinite(prior) & dr.isfinite(depth)
+        if inverse:
+            valid &= depth > 0
+        count = mi.Float(dr.maximum(dr.count(valid), 1))
+    x = dr.rcp(dr.select(valid, depth, 1)) if inverse else depth
+    x, spread_x = _centred(x, valid, count)
+    y, spread_y = _centred(prior, valid, count)
+    defined = (spread_x > 0) & (spread_y > 0)
+    r = dr.sum(x * y) / dr.select(defined, spread_x * spread_y, 1)
+    return dr.select(defined, 1 - r, 0)
+
+
+def light_variation(log_radiance):
+    """Total variation of an environment, 1/4π ∫ |∇ log L| dω per radian, summed over channels: each derivative d, along rows
+    and columns, counts as √(d² + `_SLOPE`²) − `_SLOPE`: gentle slopes by their square, edges by their height.
+
+    ``log_radiance``: ``mi.TensorXf`` [rows, columns, 3], rows from pole to pole as in `Environment`.
+    """
+    rows, columns, _ = log_radiance.shape
+    polar, azimuthal = np.pi / (rows - 1), 2 * np.pi / columns  # angles from texel to texel
+    index = dr.arange(mi.UInt32, rows * columns)
+    row, column = index // columns, index % columns
+    at = lambda i, active: dr.gather(mi.Color3f, log_radiance.array, i, active, mode=adding(3 * rows * columns))
+    length = lambda d: dr.sum(dr.sqrt(dr.square(d) + _SLOPE**2) - _SLOPE)
+    sine = dr.sin(mi.Float(row) * polar)
+    ring = (row > 0) & (row + 1 < rows)  # the poles are points
+    here = at(index, True)
+    right = at(dr.select(column + 1 < columns, index + 1, index + 1 - columns), ring)
+    along = (right - here) / dr.select(ring, azimuthal * sine, 1)
+    middle = dr.sin((mi.Float(row) + 0.5) * polar)
+    down = (at(index + columns, row + 1 < rows) - here) / polar
+    total = dr.select(ring, length(along) * sine, 0) + dr.select(row + 1 < rows, length(down) * middle, 0)
+    return dr.sum(total) * (polar * azimuthal / (4 * np.pi))
+
+
+def _centred(x, valid, count):
+    """The ``valid`` lanes of ``x`` less their mean (0 in the others), and the root of the sum of their squares; that is 0
+    where the map is constant but for rounding."""
+    with dr.suspend_grad():
+        base = dr.min(dr.select(valid, x, dr.inf))  # first, so that a sum of many alike numbers loses nothing
+    x = dr.select(valid, x - base, 0)
+    x = dr.select(valid, x - dr.sum(x) / count, 0)
+    square = dr.sum(x * x)
+    varies = square > count * dr.square(_FLAT * base)
+    return x, dr.select(varies, dr.sqrt(dr.select(varies, square, 1)), 0)

@@ -1,0 +1,159 @@
+"""What a fit learns: surfels, environment and shader in unconstrained form, and the optimiser that moves them."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.arrays import lanes, tensor
+from ..shading.environment import Environment
+from ..shading.shader import Shader, initial_weights
+from ..surfels.surfels import SH_0, Surfels
+
+#: Unconstrained parameters, a row a surfel.
+SURFEL_PARAMETERS = ("centers", "rotations", "log_scales", "logit_opacities", "sh_dc", "sh_rest", "logit_base_color",
+                     "logit_roughness", "logit_metallic", "delta_normal", "curvature")
+ENVIRONMENT, SHADER = "log_environment", "shader"
+#: The step of 3DGS's optimisers is relative to the gradient's own size, however small.
+_EPSILON = 1e-15
+_LOG_RADIANCE = (-9.0, 8.0)  # texels that no ray tells apart would else drift to overflow
+_LEAST_SCALE = 1e-6  # world units: smaller surfels overflow on the screen
+
+
+def logit(p, margin=1e-4):
+    """Inverse of the logistic function, for NumPy arrays; ``p`` is kept ``margin`` away from 0 and 1."""
+    p = np.clip(p, margin, 1 - margin)
+    return np.log(p / (1 - p))
+
+
+def _sigmoid(x):
+    return 1 / (1 + dr.exp(-x))
+
+
+class Model:
+    """Surfels, environment and shader as Adam sees them.
+
+    ``parameters``: NumPy arrays [N, channels] named as `SURFEL_PARAMETERS`, `ENVIRONMENT` [rows, columns, 3], the
+    logarithm of radiance, and `SHADER` [weights], unless f_φ is the identity. ``rotation``: [3, 3] environment frame to
+    world frame. ``two_sided``: see `Surfels`.
+    """
+
+    def __init__(self, parameters: dict, rotation: np.ndarray, two_sided: bool = True):
+        self.rotation, self.two_sided = np.asarray(rotation, np.float64), bool(two_sided)
+        self.optimizer = mi.ad.Adam(lr=1e-3, epsilon=_EPSILON)
+        for name, value in parameters.items():
+            self.optimizer[name] = tensor(value)
+
+    @classmethod
+    def start(cls, positions, normals, colors, spacing, environment, rotation, sh_order, seed=0, scale=1.0,
+              opacity=0.7, roughness=0.3, shader="identity", two_sided=None):
+        """Surfels at ``positions`` [N, 3], facing ``normals`` [N, 3] (None: random), of ``colors`` [N, 3] (linear), as wide
+        as ``scale`` times their ``spacing`` [N], all of one ``opacity`` and ``roughness``; ``two_sided`` (None: where
+        normals are random, else they point outwards); ``environment`` [rows, columns, 3] radiance to start from;
+        ``shader``: as `Settings` has it."""
+        from ..surfels.surfels import rotation_from_normal
+
+        n, rng = len(positions), np.random.default_rng(seed)
+        two_sided = normals is None if two_sided is None else two_sided
+        if normals is None:
+            normals = rng.normal(size=(n, 3))
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return cls({
+            "centers": positions,
+            "rotations": rotation_from_normal(normals, rng.uniform(0, 2 * np.pi, n)),
+            "log_scales": np.log(scale * np.repeat(spacing[:, None], 2, 1)),
+            "logit_opacities": np.full((n, 1), logit(opacity)),
+            "sh_dc": (0.5 * colors - 0.5) / SH_0,
+            "sh_rest": np.zeros((n, 3 * ((sh_order + 1) ** 2 - 1))),
+            "logit_base_color": np.full((n, 3), logit(0.5)),
+            "logit_roughness": np.full((n, 1), logit(roughness)),
+            "logit_metallic": np.full((n, 1), logit(0.4)),
+            "delta_normal": np.zeros((n, 3)),
+            "curvature": np.zeros((n, 3)),
+            ENVIRONMENT: np.log(np.maximum(environment, 1e-3)),
+            **({SHADER: initial_weights(seed)} if shader == "mlp" else {}),
+        }, rotation, two_sided)
+
+    def __len__(self):
+        return self.optimizer["centers"].shape[0]
+
+    def __getitem__(self, name):
+        return self.optimizer[name]
+
+    def surfels(self, sh_order: int) -> Surfels:
+        """The surfels, with spherical harmonics up to ``sh_order``."""
+        p = self.optimizer
+        sh = p["sh_dc"]
+        if sh_order > 0:
+            sh = dr.concat((sh, p["sh_rest"][:, : 3 * ((sh_order + 1) ** 2 - 1)]), axis=1)
+        scales = dr.maximum(dr.exp(p["log_scales"]), _LEAST_SCALE)
+        return Surfels(p["centers"], p["rotations"], scales, _sigmoid(p["logit_opacities"]), sh,
+                       _sigmoid(p["logit_base_color"]), _sigmoid(p["logit_roughness"]), _sigmoid(p["logit_metallic"]),
+                       p["delta_normal"], p["curvature"], self.two_sided)
+
+    def environment(self) -> Environment:
+        """The environment, non-negative by construction."""
+        return Environment(dr.exp(dr.clip(self.optimizer[ENVIRONMENT], *_LOG_RADIANCE)), self.rotation)
+
+    def shader(self) -> Shader | None:
+        """f_φ; None: the identity."""
+        return Shader(self.optimizer[SHADER]) if SHADER in self.optimizer else None
+
+    # ---- Surgery ----
+
+    def numpy(self, name) -> np.ndarray:
+        """One parameter as a NumPy array."""
+        return dr.detach(self.optimizer[name]).numpy()
+
+    def set(self, name, value, reset=True):
+        """Replace a parameter; its moments start again from zero, or stay where ``reset`` is off (same shape)."""
+        moments = self.optimizer.state[name][3]
+        del self.optimizer[name]
+        self.optimizer[name] = tensor(value)
+        if not reset:
+            self._set_moments(name, *moments[:3])
+
+    def select(self, index, changes):
+        """Keep the surfels ``index`` (any order, repeats allowed) with their moments, then overwrite parameters by
+        ``changes`` {name: array}. Surfels that ``fresh`` marks get zero moments."""
+        fresh = changes.pop("fresh", np.zeros(len(index), bool))
+        for name in SURFEL_PARAMETERS:
+            value = self.numpy(name)
+            t, m, v, _ = self.optimizer.state[name][3]
+            moments = [x.numpy().reshape(value.shape)[index] * ~fresh[:, None] for x in (m, v)]
+            self.set(name, changes.get(name, value[index]))
+            self._set_moments(name, t, *map(lanes, moments))
+
+    def refine_environment(self):
+        """Twice as many rows and columns of environment, on which the logarithm of radiance and its moments are as before:
+        a texel is a quarter of the old one, and so is its derivative."""
+        value = self.optimizer[ENVIRONMENT]
+        t, m, v, _ = self.optimizer.state[ENVIRONMENT][3]
+        finer = lambda texels: Environment(mi.TensorXf(texels, value.shape), self.rotation).finer().texels
+        m, v = (lanes(finer(moment).numpy().ravel() * part) for moment, part in ((m, 1 / 4), (v, 1 / 16)))
+        self.set(ENVIRONMENT, finer(dr.detach(value).array).numpy())
+        self._set_moments(ENVIRONMENT, t, m, v)
+
+    def _set_moments(self, name, t, m, v):
+        value, promoted, lr, _ = self.optimizer.state[name]
+        self.optimizer.state[name] = value, promoted, lr, (t, m, v, None)
+
+    # ---- State ----
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything a checkpoint needs, as NumPy arrays."""
+        arrays = {"rotation": self.rotation, "two_sided": np.array(self.two_sided)}
+        for name in self.optimizer.keys():
+            t, m, v, _ = self.optimizer.state[name][3]
+            arrays |= {name: self.numpy(name), f"{name}.m": m.numpy(), f"{name}.v": v.numpy(),
+                       f"{name}.t": np.array(t).ravel()[0]}
+        return arrays
+
+    @classmethod
+    def from_state(cls, arrays: dict) -> "Model":
+        """The model that wrote ``state()``."""
+        names = [name for name in (*SURFEL_PARAMETERS, ENVIRONMENT, SHADER) if name in arrays]
+        flat = {"curvature": np.zeros((len(arrays["centers"]), 3))}  # as in checkpoints of version 0.1.0
+        model = cls(flat | {name: arrays[name] for name in names}, arrays["rotation"], arrays["two_sided"])
+        for name in names:
+            model._set_moments(name, mi.UInt32(int(arrays[f"{name}.t"])), *(lanes(arrays[f"{name}.{k}"]) for k in "mv"))
+        return model

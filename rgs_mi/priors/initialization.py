@@ -1,0 +1,90 @@
+"""Where the first surfels stand: on the visual hull, on a sparse point cloud, or anywhere in view."""
+
+import numpy as np
+from scipy import spatial
+
+from ..core.color import srgb_decode
+from ..datasets.types import Dataset
+from . import hull, stereo
+
+_FAR = 10
+_SRGB_TO_LINEAR = srgb_decode(np.arange(256) / 255).astype(np.float32)
+
+
+def initial_points(dataset: Dataset, count: int, seed: int = 0, on_hull: bool = True, carve: bool = True,
+                   quiet: bool = True):
+    """Starting points of a fit to ``dataset.train``, world space, all float32.
+
+    The surface of the visual hull (of `stereo.carved_hull` with ``carve``) where photographs have masks and ``on_hull`` is
+    set (``count`` points), else ``dataset.points`` (a random ``count`` of them where there are more), else ``count`` points
+    at random in the ball that the cameras look into. ``quiet``: no progress.
+
+    Returns: positions [N, 3]; unit normals [N, 3], or None without a hull; linear colours [N, 3], the mean of the
+    photographs that see the point; spacing [N], the mean distance to the three nearest neighbours (at least 1e-7).
+    """
+    rng, views = np.random.default_rng(seed), dataset.train
+    if on_hull and any(view.masked for view in views):
+        mesh = hull.surface(stereo.carved_hull(views, quiet=quiet) if carve else hull.visual_hull(views))
+        positions, normals = hull.sample_surface(*mesh, count, rng)
+        spacing = _spacing(positions)
+        depths = hull.depth_maps(*mesh[:2], [view.camera for view in views])
+        return positions, normals, _colors(positions, views, depths, 2 * float(np.median(spacing))), spacing
+    if dataset.points is not None and len(dataset.points):
+        chosen = np.sort(rng.permutation(len(dataset.points))[:count])
+        positions = np.asarray(dataset.points, np.float32)[chosen]
+        if dataset.point_colors is not None:
+            return positions, None, np.asarray(dataset.point_colors, np.float32)[chosen], _spacing(positions)
+    else:
+        centre, reach = hull.looked_at([view.camera for view in views])
+        # Half a frame's extent at the centre, for the typical camera: inside that ball all of them see something.
+        half = np.median([min(v.camera.size[k] / v.camera.focal[k] for k in (0, 1)) / 2 for v in views])
+        ball = rng.normal(size=(count, 3))
+        ball *= rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1, keepdims=True)
+        positions = (centre + reach * min(half, 1.0) * ball).astype(np.float32)
+    return positions, None, _colors(positions, views), _spacing(positions)
+
+
+def surroundings(dataset: Dataset, count: int, seed: int = 0):
+    """Points far away for what lies behind an object without a mask: on a sphere about it, `_FAR` times as far as the
+    cameras. Returns: as `initial_points`; the normals point inwards."""
+    centre, reach = hull.looked_at([view.camera for view in dataset.train])
+    outward = np.random.default_rng((seed, 1)).normal(size=(count, 3))
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    positions = (centre + _FAR * reach * outward).astype(np.float32)
+    return positions, -outward, _colors(positions, dataset.train), _spacing(positions)
+
+
+def _spacing(positions: np.ndarray) -> np.ndarray:
+    """[N] mean distance to the three nearest neighbours, 1e-7 at least; 1 for a lone point."""
+    neighbours = min(3, len(positions) - 1)
+    if neighbours < 1:
+        return np.ones(len(positions), np.float32)
+    distance, _ = spatial.cKDTree(positions).query(positions, neighbours + 1, workers=-1)
+    return np.maximum(distance[:, 1:].mean(1), 1e-7).astype(np.float32)
+
+
+def _colors(positions, views, depths=None, tolerance=0.0) -> np.ndarray:
+    """[N, 3] mean linear colour of ``positions`` over the views that see them.
+
+    With ``depths`` (z-depth maps of ``views``) a point more than ``tolerance`` behind them is hidden. Points that no
+    view sees take the mean of all the others, or grey.
+    """
+    total = np.zeros((len(positions), 3), np.float32)
+    weight = np.zeros(len(positions), np.float32)
+    for index, view in enumerate(views):
+        pixel, z = view.camera.project(positions)
+        width, height = view.camera.size
+        seen = np.flatnonzero((z > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < width) & (pixel[:, 1] < height))
+        column, row = pixel[seen].astype(np.int64).T
+        rgba = view.pixels[row, column]
+        if view.pixels.dtype == np.uint8:
+            rgb, alpha = _SRGB_TO_LINEAR[rgba[:, :3]], rgba[:, 3] / np.float32(255)
+        else:
+            rgb, alpha = rgba[:, :3], rgba[:, 3]
+        if depths is not None:
+            alpha = np.where(z[seen] < depths[index][row, column] + tolerance, alpha, 0)  # NaN: nothing is there
+        total[seen] += rgb * alpha[:, None]
+        weight[seen] += alpha
+    known = weight > 0
+    fill = total[known].sum(0) / weight[known].sum() if known.any() else np.full(3, 0.5, np.float32)
+    return np.where(known[:, None], total / np.maximum(weight, 1e-12)[:, None], fill).astype(np.float32)

@@ -1,0 +1,137 @@
+"""What a run leaves behind: metrics.json, the scene, pictures of the test views, a contact sheet, a report, a summary."""
+
+import json
+import os
+import platform
+import resource
+import shlex
+import sys
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .. import __version__, report
+from ..core.progress import Progress
+from ..evaluation import evaluate, lpips, pictures
+from ..export.mitsuba_scene import export
+from ..fit import checkpoint
+from ..settings.config import to_dict
+
+METRICS, SHEET, GUIDED = "metrics.json", "contact_sheet.png", "guided.png"
+SHOWN = 4  # test views on the sheet and in the report, and with their G-buffers written
+_NO_LPIPS = f"not measured, for want of weights: {lpips.INSTALL}"
+
+
+def write(fit, scene, folder, quiet):
+    """Evaluate and export a `Fit` of a `FitScene` into ``folder``, and print what came out and where it is.
+
+    Where nothing was held out, pictures show training views and the figures of quality are null.
+    Raises: UserError where the disk is full or the folder can't be written.
+    """
+    facts = _facts(fit)  # the peak of memory is the fit's, not of judging it
+    with dr.suspend_grad():
+        surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
+        exported = export(folder, scene, surfels, environment, *fit.begun, fit.model.shader(),
+                          judged(fit.dataset), fit.settings.spp)
+        lighting = fit.lighting(surfels)
+    mean, scores, rows = measure(surfels, lighting, fit.dataset, fit.settings.background, fit.settings.spp, folder, quiet)
+    if (guided := fit.guided_picture()) is not None:
+        pictures.write_png(folder / GUIDED, guided / 255)
+    fit.curves.write(folder)
+    publish(folder, mean | facts | {"views": scores}, fit.curves, rows, environment, exported)
+
+
+def measure(surfels, lighting, dataset, background, spp, folder, quiet) -> tuple[dict, dict, dict]:
+    """Render the views of a `Dataset` that results are of, and write their pictures below ``folder``.
+
+    Args: see `evaluate.render_view`. Returns: the figures of quality and speed, means as metrics.json has them; its
+    ``views``, {name: scores}; and {name: `pictures.panels`} of those that are shown.
+    """
+    views, scores, rows = judged(dataset), {}, {}
+    on_sheet = {view.name for view in shown(views)}
+    with Progress(None, quiet, "evaluating") as progress:
+        for k, view in enumerate(views):
+            rendering = evaluate.render_view(surfels, lighting, view.camera, background, spp)
+            pictures.write_view(folder / "test", view, rendering, background, gbuffer=view.name in on_sheet)
+            scores[view.name] = evaluate.score(view, rendering, background)
+            if view.name in on_sheet:
+                rows[view.name] = pictures.panels(view, rendering, background)
+            progress.update((k + 1) / len(views))
+    if not dataset.test:
+        scores = {}
+    mean = evaluate.mean_scores(list(scores.values()))
+    reason = None if mean["lpips"] is not None else \
+        "not measured: no test views that are large enough" if lpips.installed() else _NO_LPIPS
+    fps = evaluate.frames_per_second(surfels, lighting, [view.camera for view in views], spp)
+    return mean | {"lpips_reason": reason, "render_fps": fps}, scores, rows
+
+
+def publish(folder, figures, curves, rows, environment, others=()):
+    """Write metrics.json, contact sheet and report into ``folder``, and print what came out and where it is, the paths
+    ``others`` among it. ``figures``: what metrics.json holds; ``curves``, ``rows``: see `report.write`."""
+    with checkpoint.atomic_file(folder / METRICS) as stream:
+        stream.write((json.dumps(figures, indent=1, default=str) + "\n").encode())
+    lines, texels = _summary(figures), environment.texels.numpy()
+    pictures.contact_sheet(folder / SHEET, list(rows.values()), texels, folder.resolve().name, lines)
+    report.write(folder, figures, curves, rows, texels)
+    print("\n".join([*lines, "", *map(str, (folder / report.REPORT, folder / SHEET, folder / METRICS, *others,
+                                           folder / "test"))]))
+
+
+def judged(dataset) -> list:
+    """The views that results are of: the held-out ones, or a few of those that are fitted."""
+    return dataset.test or dataset.train[:SHOWN]
+
+
+def shown(views) -> list:
+    """The views of a list that pictures show: `SHOWN` of them, evenly spread."""
+    return [views[k] for k in sorted({int(k) for k in np.linspace(0, len(views) - 1, SHOWN + 2)[1:-1].round()})]
+
+
+def finished(folder) -> bool:
+    """Whether the run in ``folder`` came to its end."""
+    try:
+        return bool(json.loads((folder / METRICS).read_text())["finished"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def _facts(fit) -> dict:
+    """What metrics.json says of the run as a whole, beside `measure`."""
+    return {
+        "finished": fit.progress >= 1, "train_seconds": fit.elapsed, "iterations": fit.step_number,
+        "surfels": len(fit.model), "parameters": sum(fit.model.numpy(name).size for name in fit.model.optimizer.keys()),
+        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "train_views": len(fit.dataset.train), "test_views": len(fit.dataset.test),
+        "photographs": str(fit.dataset.root.resolve()), "settings": to_dict(fit.settings), **circumstances(),
+    }
+
+
+def circumstances() -> dict:
+    """With what, where and by which command this process runs, as metrics.json has it."""
+    return {
+        "versions": {"rgs_mi": __version__, "mitsuba": mi.__version__, "drjit": dr.__version__,
+                     "python": platform.python_version()},
+        "machine": {"cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+                    "threads": dr.thread_count(), "processor": platform.machine(), "system": platform.system(),
+                    "variant": mi.variant()},
+        "command": shlex.join(sys.argv),
+    }
+
+
+def _summary(figures) -> list[str]:
+    """The figures in words, a line each."""
+    minutes, seconds = divmod(round(figures["train_seconds"]), 60)
+    quality = []
+    if figures["psnr"] is None:
+        quality.append("no test views: nothing is held out to measure on")
+    else:
+        quality += [f"PSNR {figures['psnr']:.2f} dB", f"SSIM {figures['ssim']:.4f}"]
+    if figures["lpips"] is not None:
+        quality.append(f"LPIPS {figures['lpips']:.4f}")
+    if figures["normal_mae_deg"] is not None:
+        quality.append(f"normal error {figures['normal_mae_deg']:.2f}°")
+    return [*quality, f"{figures['surfels']:,} surfels".replace(",", " "),
+            f"{figures['iterations']} steps in {minutes}:{seconds:02} min",
+            f"{figures['render_fps']:.1f} views per second"]

@@ -1,0 +1,80 @@
+"""Surfels that rays meet: a mesh of quads for Mitsuba's ray tracer."""
+
+import drjit as dr
+import mitsuba as mi
+
+from .surfels import Surfels
+
+_SOLID = 0.2  # a ray meets a surfel where it is at least this opaque
+_CLEARANCE = 2.0  # rays start that many standard deviations of a typical surfel above the surface
+_CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+_TRIANGLES = (0, 1, 2, 0, 2, 3)
+
+
+def corners(surfels, extent):
+    """Corners of every surfel's quad, four ``mi.Point3f`` of width N; ``extent``: half its width in standard deviations."""
+    t_u, t_v, _ = surfels.frames()
+    center, scale = surfels.column(mi.Point3f, "centers"), extent * surfels.column(mi.Vector2f, "scales")
+    return [center + i * scale.x * t_u + j * scale.y * t_v for i, j in _CORNERS]
+
+
+def quads(corners):
+    """(positions, faces) of two triangles a surfel: surfel number i is face i // 2."""
+    n = dr.width(corners)
+    i = dr.arange(mi.UInt32, n)
+    positions, faces = dr.empty(mi.Float, 12 * n), dr.empty(mi.UInt32, 6 * n)
+    for k, corner in enumerate(corners):
+        dr.scatter(positions, corner, 4 * i + k)
+    for k, vertex in enumerate(_TRIANGLES):
+        dr.scatter(faces, 4 * i + vertex, 6 * i + k)
+    return positions, faces
+
+
+class Proxies:
+    """Where the surfels were when this was built, for rays to meet: each as the quad in which its alpha exceeds a
+    ``solid`` threshold; only those in the ``box``, where there is one.
+
+      scene      what rays meet: surfel number i is triangles 2 i and 2 i + 1
+      extent     half the width of each quad, in standard deviations, ``mi.Float``
+      normal     geometric normals, ``mi.Vector3f``
+      clearance  how far above the surface rays start, world units, ``mi.Float`` of width 1
+    """
+
+    def __init__(self, surfels: Surfels, solid=_SOLID, box=None):
+        with dr.suspend_grad():
+            opacity = surfels.column(mi.Float, "opacities")
+            if box is not None:
+                opacity = dr.select(box.holds(surfels.column(mi.Point3f, "centers")), opacity, 0)
+            self.extent = dr.sqrt(2 * dr.log(dr.maximum(opacity / solid, 1)))
+            positions, faces = quads(corners(surfels, self.extent))
+            self.normal = surfels.frames()[2]
+            scale = surfels.column(mi.Vector2f, "scales")
+            count = dr.opaque(mi.Float, len(surfels))  # dr.mean would compile it into a kernel
+            self.clearance = _CLEARANCE * dr.sum(dr.minimum(scale.x, scale.y)) / count
+            dr.eval(positions, faces, self.extent, self.normal, self.clearance)
+            mesh = mi.Mesh("proxies", 4 * len(surfels), 2 * len(surfels))
+            params = mi.traverse(mesh)
+            params["vertex_positions"], params["faces"] = positions, faces
+            params.update()
+            self.scene = mi.load_dict({"type": "scene", "proxies": mesh})
+        self.two_sided = surfels.two_sided
+
+    def meet(self, origin, normal, direction, active=True):
+        """(found, number, place): whether the ray of an ``active`` lane meets the front of a surfel, which, and where on it
+        (see `Surfels.normals`). ``normal``: of the surface that the rays leave."""
+        with dr.suspend_grad():
+            ray = mi.Ray3f(mi.Point3f(origin + self.clearance * normal), mi.Vector3f(direction))
+            hit = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
+            found, number = hit.is_valid(), hit.prim_index // 2
+            if not self.two_sided:
+                found &= dr.dot(dr.gather(mi.Vector3f, self.normal, number, found), ray.d) < 0
+            place = dr.gather(mi.Float, self.extent, number, found) * mi.Point2f(*self.position(hit))
+            dr.eval(found, number, place)
+            return found, number, place
+
+    @staticmethod
+    def position(hit):
+        """(x, y) from −1 to 1 of a ray tracer's ``hit`` on its quad, along t_u and t_v."""
+        b_1, b_2 = hit.prim_uv
+        first = (hit.prim_index & 1) == 0  # of `_TRIANGLES`: the corners 0 1 2, then 0 2 3
+        return 2 * (dr.select(first, b_1 + b_2, b_1)) - 1, 2 * dr.select(first, b_2, b_1 + b_2) - 1

@@ -1,0 +1,251 @@
+"""The command line: what a run leaves behind, going on after a crash, and mistakes that cost one line each."""
+
+import json
+import signal
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from PIL import Image
+
+from rgs_mi.core.errors import UserError
+from rgs_mi.fit import checkpoint
+from rgs_mi.fit.trainer import Fit
+
+from runs import PATIENCE, SMALL, assert_renders_as_written, start_script, wait_for
+
+SHOWN = ("psnr", "ssim", "lpips", "normal_mae_deg", "surfels", "iterations", "train_seconds", "render_fps",
+         "peak_rss_mb")
+
+
+@pytest.fixture(scope="module")
+def run(inputs, tmp_path_factory):
+    """The folder of a finished run."""
+    scene, data = inputs
+    return fit(scene, data, tmp_path_factory.mktemp("runs") / "ball")
+
+
+def fit(scene, data, out, overrides=SMALL, **options):
+    from rgs_mi.commands.optimize import optimize
+
+    return optimize(scene, data=data, out=out, overrides=overrides, quiet=True, **options)
+
+
+def metrics(folder):
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def test_metrics(run):
+    figures = metrics(run)
+    assert figures["finished"] and figures["iterations"] == 20 and figures["surfels"] > 0
+    assert all(name in figures for name in SHOWN)
+    assert (figures["lpips"] is None) == bool(figures["lpips_reason"])
+    assert figures["psnr"] > 10 and figures["normal_mae_deg"] < 30
+    assert figures["settings"]["start"]["surfels"] == 300
+    assert list(figures["views"]) == ["r_0", "r_1", "r_2"]
+    assert figures["psnr"] == pytest.approx(np.mean([v["psnr"] for v in figures["views"].values()]))
+
+
+def test_files(run):
+    for name in ("object.ply", "environment.exr", "scene.xml", "contact_sheet.png", "test/r_0_compare.png"):
+        assert (run / name).stat().st_size > 0
+    maps = mi.Bitmap(str(run / "test" / "r_0_gbuffer.exr"))
+    names = [field.name for field in maps.struct_()]
+    normal, alpha = (np.array(maps)[..., [names.index(n) for n in pick]]
+                     for pick in (["normal.X", "normal.Y", "normal.Z"], ["alpha.Y"]))
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), alpha[..., 0], atol=1e-4)
+    assert not [p for p in run.rglob("*.tmp")]
+
+
+def test_exported_scene_renders_the_same(run):
+    scene = mi.load_file(str(run / "scene.xml"))
+    np.testing.assert_array_equal(np.array(mi.traverse(scene)["environment.data"])[:, 1:-1],
+                                  np.array(mi.Bitmap(str(run / "environment.exr"))))
+    assert len(scene.sensors()) == 3
+    assert_renders_as_written(scene, run)
+
+
+@pytest.mark.parametrize("preset", ["paper", "deferred2dgs", "sh2dgs", "mirror"])
+def test_presets(inputs, tmp_path, preset):
+    folder = fit(*inputs, tmp_path / "run", config=preset, overrides=[*SMALL, "iterations=3"])
+    assert (folder / "guided.png").exists() == (preset == "paper")
+    assert_renders_as_written(mi.load_file(str(folder / "scene.xml")), folder)
+
+
+def test_indirect_light_is_exported(inputs, tmp_path):
+    folder = fit(*inputs, tmp_path / "run", overrides=[*SMALL, "indirect=one_bounce", "indirect_start=0"])
+    scene = mi.load_file(str(folder / "scene.xml"))
+    assert scene.integrator().indirect == "one_bounce"
+    assert_renders_as_written(scene, folder)
+
+
+@pytest.mark.parametrize("old, new", [
+    ('type="rgs_deferred">', 'type="rgs_deferred"><string name="specular" value="none"/>'),
+    ('type="rgs_deferred">', 'type="rgs_deferred"><string name="specular" value="monte_carlo"/>'),
+    ('<default name="diffuse" value="radiance"/>', '<default name="diffuse" value="lit"/>'),
+    ('<bsdf type="principled" id="material"/>', '<bsdf type="principled"><float name="eta" value="2.5"/></bsdf>')])
+def test_shading_is_the_scenes(inputs, tmp_path, old, new):
+    scene, data = inputs
+    other = tmp_path / "other.xml"
+    other.write_text(scene.read_text().replace(old, new))
+    folder = fit(other, data, tmp_path / "run", overrides=[*SMALL, "iterations=3"])
+    assert_renders_as_written(mi.load_file(str(folder / "scene.xml")), folder)
+
+
+def test_photographs_without_masks(inputs, tmp_path):
+    """RGB files: the fit starts from random points, and from surroundings; what is in a box reflects."""
+    scene, data = inputs
+    for path in data.glob("transforms_*.json"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    for path in data.glob("*/r_*[0-9].png"):
+        (tmp_path / path.parent.name).mkdir(exist_ok=True)
+        white = Image.new("RGBA", Image.open(path).size, "white")
+        white.alpha_composite(Image.open(path))
+        white.convert("RGB").save(tmp_path / path.parent.name / path.name)
+    process = start_script("optimize.py", scene, "--data", tmp_path, "--out", tmp_path / "run", "--quiet",
+                           *(word for setting in [*SMALL, "iterations=30", "density.interval=10", "density.start=0",
+                                                  "sh_start=0.2", "start.surroundings=100"] for word in ("--set", setting)))
+    _, error = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0 and error == "", error
+    figures = metrics(tmp_path / "run")
+    assert figures["finished"] and figures["psnr"] > 8 and figures["normal_mae_deg"] is None
+    scene = mi.load_file(str(tmp_path / "run" / "scene.xml"))
+    assert 1 < scene.integrator().box.radius < 6
+    assert np.linalg.norm(mi.traverse(scene)["object.centers"].numpy(), axis=1).max() > 10
+    assert_renders_as_written(scene, tmp_path / "run")
+
+
+def test_render(run, tmp_path):
+    from rgs_mi.export.render import AOVS, render_scene
+
+    (file,) = render_scene(run, view="r_1", size=20, spp=4, aovs=True, out=tmp_path / "one.png")
+    assert Image.open(file).size == (20, 20) and Image.open(file).mode == "RGBA"
+    channels = [field.name for field in mi.Bitmap(str(file.with_suffix(".exr"))).struct_()]
+    assert {name.split(".")[0] for name in channels} == {*AOVS, "R", "G", "B", "A"}
+    frames = render_scene(run, turntable=3, size=16, out=tmp_path / "turn", quiet=True)
+    alpha = [np.asarray(Image.open(frame))[..., 3] for frame in frames]
+    assert len(frames) == 3 and all(a.max() > 200 and a.min() == 0 for a in alpha)
+    with pytest.raises(UserError, match="no view 'r_9'"):
+        render_scene(run, view="r_9", out=tmp_path)
+
+
+def test_resume_after_a_crash(inputs, tmp_path, monkeypatch, capsys):
+    step = Fit.step
+
+    def crash(self):
+        if self.step_number == 12:
+            raise RuntimeError("lights out")
+        step(self)
+
+    monkeypatch.setattr(Fit, "step", crash)
+    with pytest.raises(RuntimeError):
+        fit(*inputs, tmp_path)
+    monkeypatch.undo()
+    with pytest.raises(UserError, match="--resume"):
+        fit(*inputs, tmp_path)
+    assert checkpoint.load_latest(tmp_path)[1]["step"] == 12 and not (tmp_path / "metrics.json").exists()
+    fit(*inputs, tmp_path, overrides=[*SMALL, "weights.mask=0.2"], resume=True)
+    assert metrics(tmp_path)["iterations"] == 20
+    assert "weights.mask 0.1 -> 0.2" in capsys.readouterr().err
+    with pytest.raises(UserError, match="sh_order"):
+        fit(*inputs, tmp_path, overrides=[*SMALL, "sh_order=0"], resume=True)
+    fit(*inputs, tmp_path, overrides=[*SMALL, "iterations=2"])  # a finished run may be overwritten
+    assert metrics(tmp_path)["iterations"] == 2
+
+
+def test_nothing_to_resume(inputs, tmp_path, capsys):
+    fit(*inputs, tmp_path, overrides=[*SMALL, "iterations=1"], resume=True)
+    assert "from the beginning" in capsys.readouterr().err
+
+
+def test_full_disk_does_not_end_the_fit(inputs, tmp_path, monkeypatch):
+    save, calls = checkpoint.save, []
+
+    def full_at_third(*arguments):
+        calls.append(1)
+        if len(calls) == 3:
+            raise UserError("no space")
+        return save(*arguments)
+
+    monkeypatch.setattr(checkpoint, "save", full_at_third)
+    with pytest.warns(UserWarning, match="no space"):
+        fit(*inputs, tmp_path)
+    assert metrics(tmp_path)["iterations"] == 20
+
+
+def test_divergence_keeps_the_last_checkpoint(inputs, tmp_path, monkeypatch):
+    step = Fit.step
+
+    def diverge(self):
+        step(self)
+        if self.step_number == 5:
+            self.psnr = float("nan")
+
+    monkeypatch.setattr(Fit, "step", diverge)
+    with pytest.raises(UserError, match="diverged at step 5"):
+        fit(*inputs, tmp_path)
+    assert checkpoint.load_latest(tmp_path)[1]["step"] == 4
+
+
+def test_no_test_views(inputs, tmp_path):
+    scene, data = inputs
+    copy = tmp_path / "data"
+    copy.mkdir()
+    (copy / "train").symlink_to(data / "train")
+    (copy / "transforms_train.json").write_bytes((data / "transforms_train.json").read_bytes())
+    figures = metrics(fit(scene, copy, tmp_path / "run", overrides=[*SMALL, "iterations=2"]))
+    assert figures["psnr"] is None and figures["ssim"] is None and figures["views"] == {}
+    assert (tmp_path / "run" / "contact_sheet.png").is_file()
+
+
+def test_interrupt(inputs, tmp_path):
+    scene, data = inputs
+    process = start_script("optimize.py", scene, "--data", data, "--out", tmp_path, "--set", "iterations=1000000",
+                           "--set", "start.surfels=300", "--set", "checkpoint_seconds=0")
+    wait_for(lambda: any((tmp_path / "checkpoints").glob("step_*[1-9].npz")), process)
+    process.send_signal(signal.SIGINT)
+    out, error = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 0, error
+    assert "--resume" in out and "Traceback" not in error
+    figures = metrics(tmp_path)
+    assert not figures["finished"]
+    assert checkpoint.load_latest(tmp_path)[1]["step"] == figures["iterations"] > 0
+
+
+def test_mistakes(inputs, tmp_path):
+    """Each ends with code 2 and one line that names the trouble."""
+    scene, data = inputs
+    write = lambda name, text: (tmp_path / name).write_text(text) and tmp_path / name
+    sensor = scene.read_text().replace("</scene>", '<sensor type="orthographic" id="flat"/></scene>')
+    cases = {
+        "nowhere": [scene, "--data", tmp_path / "nowhere"],
+        "--data": [scene],
+        "Parsing of XML": [write("bad.xml", "<scene version='3.0.0'><shape")],
+        "no scene at": [tmp_path / "none.xml"],
+        "malformed YAML": [scene, "--data", data, "--config", write("bad.yaml", "density: [1, ")],
+        "did you mean": [scene, "--data", data, "--set", "densty.start=0.1"],
+        "'flat' is a OrthographicCamera": [write("flat.xml", sensor), "--data", data],
+        "integrator is a": [write("path.xml", scene.read_text().replace("rgs_deferred", "path").replace(
+            '<string name="diffuse" value="$diffuse"/>', "")), "--data", data],
+        "write name=value": [scene, "--data", data, "-D", "width"],
+        "can't be written": [scene, "--data", data, "--out", scene / "run"],
+    }
+    processes = {text: start_script("optimize.py", *arguments) for text, arguments in cases.items()}
+    for text, process in processes.items():
+        out, error = process.communicate(timeout=PATIENCE)
+        assert process.returncode == 2, (text, out, error)
+        assert error.startswith("error: ") and len(error.splitlines()) == 1 and text in error, (text, error)
+
+
+def test_benchmark(tmp_path, capsys):
+    from rgs_mi.commands import benchmark
+
+    other = tmp_path / "other.py"
+    other.write_text("for name in ('lists', 'forward', 'backward'): print(f'{name:10s} 1000.0 ms  (first call 1 ms)')")
+    benchmark.splat(500, 64, other, rounds=1)
+    rows = {line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines()[2:]}
+    assert list(rows) == ["lists", "forward", "backward", "total"]
+    assert float(rows["total"][1]) == 3000 and all(float(r[0]) > 0 for r in rows.values())
+    other.write_text("print('forward 1.0 ms')")
+    with pytest.raises(UserError, match="no time of 'lists'"):
+        benchmark.splat(500, 64, other, rounds=1)

@@ -1,0 +1,61 @@
+"""Killed at random moments and resumed, a fit ends where an undisturbed one does.
+
+``python tests/test_resume.py 20`` does it with twenty kills.
+"""
+
+import json
+import random
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from runs import make_inputs, start_script
+
+OPTIONS = ["--quiet", "--set", "iterations=300", "--set", "start.surfels=2000", "--set", "checkpoint_seconds=0.3"]
+TOLERANCE = 0.2  # dB: sums of floats differ from run to run
+
+
+def kill_and_resume(folder: Path, kills: int, seed=0) -> tuple[float, float, int]:
+    """(PSNR undisturbed, PSNR after being killed, kills that hit a running fit)."""
+    scene, data = make_inputs(folder, size=96)
+    options = [scene, "--data", data, *OPTIONS]
+    begin = time.monotonic()
+    finish(start_script("optimize.py", *options, "--out", folder / "whole"))
+    fitting = metrics(folder / "whole")["train_seconds"]
+    around, rng, hits = time.monotonic() - begin - fitting, random.Random(seed), 0  # start, evaluation
+    for _ in range(kills):
+        process = start_script("optimize.py", *options, "--out", folder / "killed", "--resume")
+        time.sleep(rng.uniform(0.2, 0.5) * around + rng.uniform(0, 2) * fitting / (kills + 1))
+        hits += process.poll() is None
+        process.kill()
+        process.communicate()
+    finish(start_script("optimize.py", *options, "--out", folder / "killed", "--resume"))
+    return metrics(folder / "whole")["psnr"], metrics(folder / "killed")["psnr"], hits
+
+
+def metrics(run):
+    return json.loads((run / "metrics.json").read_text())
+
+
+def finish(process):
+    _, error = process.communicate(timeout=600)
+    assert process.returncode == 0, error
+
+
+@pytest.mark.slow
+def test_killed_and_resumed(tmp_path):
+    whole, killed, hits = kill_and_resume(tmp_path, kills=3)
+    assert hits > 0
+    assert abs(whole - killed) < TOLERANCE
+
+
+if __name__ == "__main__":
+    import rgs_mi
+
+    rgs_mi.set_variant()
+    with tempfile.TemporaryDirectory() as temporary:
+        print("undisturbed {:.2f} dB, killed {:.2f} dB, {} of the kills hit".format(
+            *kill_and_resume(Path(temporary), int(sys.argv[1]))))

@@ -1,0 +1,125 @@
+"""The box around an object without a mask: what reflects and is met is in it, and its surroundings lie beyond."""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from rgs_mi.core.bounding_box import Box
+from rgs_mi.datasets.types import Dataset, View
+from rgs_mi.fit.density import Gradients, densify
+from rgs_mi.fit.model import Model
+from rgs_mi.priors.initialization import surroundings
+from rgs_mi.settings.settings import Density
+from rgs_mi.shading import deferred
+from rgs_mi.shading.environment import Environment
+from rgs_mi.shading.split_sum import SplitSum
+from rgs_mi.surfels.proxies import Proxies
+from rgs_mi.surfels.surfels import CHANNELS
+
+from scenes import orbit_camera, sphere_surfels
+
+BOX = Box((-2.0, -2.0, -2.0), (2.0, 0.0, 2.0))  # half of the unit sphere
+
+
+def cameras(count=8, distance=4.0):
+    return [orbit_camera(angle, distance=distance) for angle in np.linspace(0, 6, count)]
+
+
+def photographs():
+    """Views of nothing but red, without masks."""
+    red = np.zeros((40, 48, 4), np.uint8)
+    red[:] = 255, 0, 0, 255
+    return Dataset([View(str(k), camera, red, False, None, None) for k, camera in enumerate(cameras())], [])
+
+
+def test_found_from_cameras():
+    box = Box.seen_by(cameras())
+    inside = lambda p: (np.array(box.lower) < p).all() and (p < np.array(box.upper)).all()
+    assert inside(np.zeros(3)) and 1.5 < box.radius < 2.5
+    assert not any(inside(camera.origin) for camera in cameras())
+    np.testing.assert_allclose(box.centre, 0, atol=0.15)
+    larger = Box.seen_by(cameras(distance=8.0))
+    assert larger.radius == pytest.approx(2 * box.radius, rel=0.1)
+
+
+@pytest.mark.parametrize("numbers", [(0, 0, 0, 1, 1), (0, 0, 0, 1, 0, 1), (0, 0, 0, 1, 1, float("inf"))])
+def test_six_numbers(numbers):
+    with pytest.raises(ValueError, match="a box is six numbers"):
+        Box.of(numbers)
+    assert Box.of(map(float, str(BOX).split())) == BOX
+
+
+@pytest.mark.parametrize("lit", [False, True])
+def test_only_what_is_in_the_box_reflects(lit):
+    surfels, camera = sphere_surfels(800, scale=1.0), orbit_camera(0.3)
+    environment = Environment(mi.TensorXf(np.random.default_rng(0).random((8, 16, 3), np.float32)), np.eye(3)).filtered()
+    shade = lambda box: deferred.render(surfels, camera, deferred.Lighting(SplitSum(environment), lit=lit, box=box))
+    whole, half, none = (np.array(shade(box).color).T for box in (None, BOX, Box((5.0,) * 3, (6.0,) * 3)))
+    own = np.array(deferred.render(surfels, camera, None).color).T
+    np.testing.assert_array_equal(none, own)
+    maps = deferred.render(surfels, camera, None).gbuffer.all
+    alpha, depth = maps.alpha.numpy(), maps.depth.numpy()
+    points = camera.origin + (camera.rays() * (depth / np.maximum(alpha, 1e-9)).reshape(40, 48, 1)).reshape(-1, 3)
+    sure = (alpha > 0.5) & (abs(points[:, 1]) > 1e-3)
+    reflects = sure & (points[:, 1] < 0)
+    assert min(reflects.sum(), (sure & ~reflects).sum()) > 100
+    np.testing.assert_allclose(half[reflects], whole[reflects], atol=1e-6)
+    np.testing.assert_allclose(half[sure & ~reflects], own[sure & ~reflects], atol=1e-6)
+    assert abs(whole - own)[sure & ~reflects].mean() > 0.01
+
+
+def test_rays_meet_what_is_in_the_box():
+    surfels, rng = sphere_surfels(200, scale=0.7), np.random.default_rng(1)
+    centers = surfels.numpy()["centers"]
+    target = centers[rng.integers(200, size=2000)]
+    direction = -target
+    met = {}
+    for box in (BOX, None):
+        rays = mi.Point3f((3 * target).T), mi.Vector3f(0), mi.Vector3f(direction.T)
+        found, number, _ = Proxies(surfels, box=box).meet(*rays)
+        met[box] = centers[number.numpy()[found.numpy()], 1]
+        assert len(met[box]) > 500
+    assert (met[BOX] <= 0).all() and (met[None] > 0).mean() > 0.3
+
+
+def test_in_scenes():
+    surfels = sphere_surfels(800, scale=1.0)
+    shape = {"type": "surfels"} | {name: getattr(surfels, name) for name in CHANNELS}
+    sensor = mi.load_dict(orbit_camera(0.3).to_sensor_dict())
+    scene = mi.load_dict({"type": "scene", "object": shape, "light": {"type": "constant"}})
+    image = lambda kind, **more: np.array(mi.render(scene, sensor=sensor, spp=4, integrator=mi.load_dict(
+        {"type": kind, "hide_emitters": True, **more})))
+    everywhere, half = image("rgs_deferred"), image("rgs_deferred", box=str(BOX))
+    assert 0.1 < (abs(everywhere - half).max(-1) > 0.01).mean() < 0.8 * (everywhere.max(-1) > 0).mean()
+    np.testing.assert_array_equal(half, image("rgs_deferred", box="-2,-2,-2, 2,0,2"))
+    taken_out = image("rgs_path", box=str(BOX))
+    assert 0.05 < (taken_out.max(-1) > 0).mean() < (half.max(-1) > 0).mean()
+    for kind in ("rgs_deferred", "rgs_path"):
+        with pytest.raises(Exception, match="box '1 2 3': a box is six numbers"):
+            mi.load_dict({"type": kind, "box": "1 2 3"})
+
+
+def test_surroundings():
+    positions, normals, colors, spacing = surroundings(photographs(), 300)
+    distance = np.linalg.norm(positions, axis=1)
+    assert (distance > 30).all() and (distance < 60).all()
+    assert ((positions * normals).sum(1) < 0).all() and (spacing > 1).all()
+    np.testing.assert_allclose(colors, np.tile([1, 0, 0], (300, 1)), atol=1e-6)
+
+
+def test_far_surfels_may_be_large():
+    positions = np.array([[0.0, 0, 0], [40, 0, 0], [0, 0.5, 0]], np.float32)
+    spacing = np.array([0.1, 3.0, 3.0], np.float32)
+    colors, light = np.full((3, 3), 0.5, np.float32), np.ones((4, 8, 3), np.float32)
+    def left(extent):
+        model = Model.start(positions, None, colors, spacing, light, np.eye(3), 1)
+        for name in model.optimizer.keys():
+            dr.set_grad(model[name], dr.zeros(mi.TensorXf, model[name].shape))
+        model.optimizer.step()
+        gradients = Gradients(3)
+        gradients.add(dr.zeros(mi.Vector2f, 3), dr.full(mi.Bool, True, 3), (100, 100))
+        densify(model, gradients, extent, Density(), np.random.default_rng(0), 10)
+        return model.numpy("centers")
+    np.testing.assert_array_equal(left(1.0), positions[:1])
+    np.testing.assert_array_equal(left(np.array([1.0, 40.0, 1.0])), positions[:2])

@@ -1,0 +1,318 @@
+"""The fit: crops, schedules, kernels that are not recompiled, and resuming."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from rgs_mi.commands.optimize import start
+from rgs_mi.core.arrays import lanes
+from rgs_mi.datasets.photographs import Photographs
+from rgs_mi.datasets.types import DepthPrior
+from rgs_mi.fit import losses
+from rgs_mi.fit import trainer as fit_module
+from rgs_mi.fit.density import Gradients
+from rgs_mi.fit.trainer import Fit
+from rgs_mi.settings.settings import Density, Rates, Settings, Stage, Start, Weights
+from rgs_mi.shading import deferred
+from rgs_mi.shading.deferred import Shading
+from rgs_mi.shading.environment import Environment
+from rgs_mi.shading.indirect import Indirect
+from rgs_mi.shading.split_sum import SplitSum
+from rgs_mi.surfels.surfels import Surfels
+
+from fits import SETTINGS, model
+from scenes import sphere_surfels
+
+
+@pytest.mark.parametrize("downscale", [1, 2])
+def test_crops_hold_the_object_and_their_cameras_fit(dataset, downscale):
+    photographs = Photographs(dataset.train, downscale, 1.0)
+    sizes = set()
+    surfels = sphere_surfels(300, seed=2, scale=0.9, opacity_shift=4)
+    lighting = deferred.Lighting(SplitSum(model().environment().filtered()))
+    surfels = Surfels.from_numpy(surfels.numpy(), two_sided=False)
+    for i, view in enumerate(dataset.train):
+        photo = photographs[i]
+        alpha = photo.alpha
+        sizes.add(photo.camera.size)
+        assert photo.size == tuple(n // downscale for n in view.camera.size)
+        full = view.pixels[..., 3].astype(float) / 255
+        assert alpha.numpy().sum() * downscale**2 == pytest.approx(full.sum(), rel=0.01)
+        rendered = deferred.render(surfels, photo.camera, lighting).gbuffer.all.alpha.numpy()
+        assert np.abs(rendered - alpha.numpy()).mean() < 0.03  # a camera that is off by a pixel gives more
+    assert len(sizes) == 1
+    assert downscale > 1 or np.prod(sizes.pop()) < 0.8 * 83 * 75
+
+
+@pytest.mark.parametrize("downscale", [1, 2])
+def test_priors_are_cropped_like_photographs(dataset, downscale):
+    """A prior that is the mask itself, with a hole."""
+    values = [np.where(v.pixels[..., 3] > 127, v.pixels[..., 3] / 255, np.nan).astype(np.float32) for v in dataset.train]
+    photographs = Photographs(dataset.train, downscale, 1.0, [DepthPrior(v, inverse=True) for v in values])
+    photo = photographs[2]
+    prior, alpha = photo.prior.numpy(), photo.alpha.numpy()
+    assert photo.inverse and prior.shape == alpha.shape and np.isnan(prior[alpha < 0.2]).all()
+    assert np.abs(prior - alpha)[(alpha > 0.9) & np.isfinite(prior)].max() < 0.2
+    assert Photographs(dataset.train, downscale, 1.0)[2].prior is None
+
+
+def test_a_fit_gets_better(dataset):
+    fit = Fit(dataset, model(), SETTINGS, 1.0)
+    fit.step()
+    first = fit.psnr
+    while fit.progress < 1:
+        fit.step()
+    assert fit.psnr > first + 2
+    assert fit.views_used == fit.step_number == 40
+
+
+def test_a_wrong_depth_prior_bends_the_surface(dataset):
+    """A plane as the prior and a great weight: the rendered depth takes its slope."""
+    rows = np.broadcast_to(np.arange(75, dtype=np.float32)[:, None], (75, 83))
+    settings = replace(SETTINGS, weights=Weights(dssim=0, mask=0, normal=0, depth=10), rates=Rates(centers=(5e-3, 5e-3)))
+    correlation = {}
+    for sign in (1, -1):
+        fit = Fit(dataset, model(), settings, 1.0, priors=[DepthPrior(sign * rows)] * 6)
+        while fit.progress < 1:
+            fit.step()
+        maps = deferred.render(fit.model.surfels(0), dataset.train[0].camera, None).gbuffer.all
+        alpha = maps.alpha.numpy()
+        depth = (maps.depth.numpy() / np.maximum(alpha, 1e-3))[alpha > 0.5]
+        correlation[sign] = np.corrcoef(depth, rows.ravel()[alpha > 0.5])[0, 1]
+    assert correlation[1] > correlation[-1] + 0.2
+
+
+def test_specular_starts_late(dataset):
+    fit = Fit(dataset, model(), replace(SETTINGS, specular_start=0.5), 1.0)
+    before = fit.model.numpy("log_environment")
+    changed = []
+    while fit.progress < 1:
+        fit.step()
+        changed.append(not np.array_equal(before, fit.model.numpy("log_environment")))
+    assert not any(changed[:19]) and changed[-1]
+    assert Fit(dataset, model(), replace(SETTINGS, specular_start=1.0), 1.0).shading.specular == "none"
+
+
+@pytest.mark.parametrize("shading", [Shading("monte_carlo"), Shading("monte_carlo", "lit"), Shading("split_sum", "lit")])
+def test_estimators_learn(dataset, shading):
+    """Each of them improves on a start with wrong roughness and colours; a fit that samples the light begins without."""
+    settings = replace(SETTINGS, iterations=40, monte_carlo_start=0.2, monte_carlo_samples=2)
+    fit, errors, kinds = Fit(dataset, model(), settings, 1.0, shading), [], []
+    while fit.progress < 1:
+        fit.step()
+        errors.append(fit.psnr)
+        kinds.append(type(fit.lighting(fit.model.surfels(0), training=True).estimator).__name__)
+    assert np.mean(errors[-6:]) > np.mean(errors[:6]) + 1
+    assert kinds[0] == "SplitSum" and kinds[-2] == ("MonteCarlo" if shading.specular == "monte_carlo" else "SplitSum")
+    assert dr.all(dr.isfinite(fit.model["log_environment"].array))
+
+
+def test_guided_surfels_need_half_the_gradient(dataset):
+    """What is reflective covers the object here, so all surfels are guided, and more of them pass the threshold."""
+    grown = {}
+    for guided in (False, True):
+        density = Density(start=0.0, stop=1.0, interval=20, threshold=2e-3, guided=guided, max_surfels=10_000)
+        fit = Fit(dataset, model(), replace(SETTINGS, iterations=21, density=density), 1.0)
+        while fit.progress < 1:
+            fit.step()
+        grown[guided] = len(fit.model)
+        picture = fit.guided_picture()
+        assert (picture is not None) == guided
+        assert not guided or len(np.unique(picture.reshape(-1, 3), axis=0)) > 10
+    assert grown[True] > grown[False] > 0
+
+
+def test_without_specular_the_environment_stays(dataset, monkeypatch):
+    monkeypatch.setattr(Environment, "filtered", None)  # nothing asks for it
+    fit = Fit(dataset, model(), SETTINGS, 1.0, shading=Shading("none"))
+    before = {name: fit.model.numpy(name) for name in ("log_environment", "sh_dc", "centers")}
+    for _ in range(10):
+        fit.step()
+    same = {name: np.array_equal(value, fit.model.numpy(name)) for name, value in before.items()}
+    assert same == {"log_environment": True, "sh_dc": False, "centers": False}
+    again = Fit.resume(dataset, SETTINGS, *fit.state(), shading=Shading("none"))
+    again.step()
+    assert np.isfinite(again.psnr)
+
+
+def test_every_view_is_used_once_a_round(dataset):
+    fit = Fit(dataset, model(), SETTINGS, 1.0)
+    rounds = [fit._next_views(4) + fit._next_views(2) for _ in range(3)]
+    assert all(sorted(r) == list(range(6)) for r in rounds) and len({tuple(r) for r in rounds}) > 1
+
+
+def test_distortion_draws_surfels_together(dataset):
+    """Of three shells, one in the other: the depths that a ray meets come closer."""
+    spread = {}
+    for weight in (0.0, 1000.0):  # as 2DGS has it
+        weights = Weights(dssim=0, mask=0, normal=0, distortion=weight)
+        settings = replace(SETTINGS, weights=weights, rates=Rates(centers=(5e-3, 5e-3)))  # far in few steps
+        fit = Fit(dataset, model(), settings, 1.0)
+        fit.model.set("centers", fit.model.numpy("centers") * np.linspace(0.9, 1.1, 3)[np.arange(300) % 3, None])
+        while fit.progress < 1:
+            fit.step()
+        maps = deferred.render(fit.model.surfels(0), dataset.train[0].camera, None, full=True).gbuffer.all
+        spread[weight] = losses.distortion(maps, 1.0)[0]
+    assert spread[1000.0] < 0.7 * spread[0.0]
+
+
+@pytest.mark.parametrize("indirect, diffuse", [("none", "radiance"), ("one_bounce", "radiance"), ("one_bounce", "lit")])
+def test_no_kernel_is_compiled_after_warm_up(dataset, indirect, diffuse, monkeypatch):
+    """Also with another number of surfels: density control changes it all the time."""
+    hits, radiance = [], Indirect._radiance
+    monkeypatch.setattr(Indirect, "_radiance", lambda *args: (hits.append(dr.width(args[1])), radiance(*args))[1])
+    settings = replace(SETTINGS, iterations=1000, indirect=indirect, indirect_start=0.0)
+    fit = Fit(dataset, model(), settings, 1.0, Shading(diffuse=diffuse))
+    centers = fit.model.numpy("centers")
+    fit.model.set("centers", centers + np.where(np.arange(len(centers)) % 2, 0, 1.5)[:, None])  # two balls, side by side
+    for n in (290, 270):
+        for _ in range(4):
+            fit.step()
+        fit.model.select(np.arange(n), {})
+        fit.gradients, fit.proxies = Gradients(n), None
+    fit.step()
+    fit.model.select(np.arange(250), {})
+    fit.gradients, fit.proxies = Gradients(250), None
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for _ in range(8):
+            fit.step()
+        history = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    assert len(history) > 100 and (len(set(hits)) > 5) == (indirect != "none")
+    assert min(hits[-8:], default=2) > 1  # a single ray takes other kernels
+    assert (fit.share is not None) == (diffuse == "lit")
+    assert [k["hash"] for k in history if not k["cache_hit"] or k["cache_disk"]] == []  # nor read from earlier sessions
+
+
+def test_resume_goes_on_where_it_stopped(dataset):
+    whole = Fit(dataset, model(), SETTINGS, 1.0)
+    for _ in range(12):
+        whole.step()
+    half = Fit(dataset, model(), SETTINGS, 1.0)
+    for _ in range(6):
+        half.step()
+    again = Fit.resume(dataset, SETTINGS, *half.state())
+    for _ in range(6):
+        again.step()
+    assert again.step_number == 12 and again.views_used == 12
+    # atomic additions round differently from run to run, and Adam's first steps amplify it
+    assert np.abs(again.model.numpy("centers") - whole.model.numpy("centers")).max() < 2e-3
+    assert again.psnr == pytest.approx(whole.psnr, abs=0.1)
+
+
+def test_progress_and_bands_of_harmonics(dataset):
+    settings = Settings(minutes=1.0, sh_order=2, sh_start=0.5)
+    fit = Fit(dataset, model(), settings, 1.0)
+    orders = []
+    for elapsed in (0, 29, 31, 46, 60, 99):
+        fit.elapsed = elapsed
+        orders.append(fit.sh_order)
+    assert orders == [0, 0, 1, 2, 2, 2] and fit.progress == 1
+
+
+def test_a_fit_that_is_stopped_is_shaded_by_what_has_begun(dataset):
+    settings = replace(SETTINGS, iterations=100, specular_start=0.2, indirect="one_bounce", indirect_start=0.4,
+                       monte_carlo_start=0.6)
+    fit, begun = Fit(dataset, model(), settings, 1.0, Shading("monte_carlo")), []
+    for fit.step_number in (10, 30, 50, 70):
+        shading, indirect = fit.begun
+        begun.append((shading.specular, indirect))
+        lighting = fit.lighting(fit.model.surfels(0))
+        assert (lighting is None) == (shading.specular == "none")
+        assert (lighting is not None and lighting.indirect is not None) == (indirect != "none")
+    assert begun == [("none", "none"), ("split_sum", "none"), ("split_sum", "one_bounce"), ("monte_carlo", "one_bounce")]
+
+
+@pytest.mark.parametrize("two_sided, normals_start, part", [(False, 0.2, 0.1), (False, 0.0, 1), (True, 0.2, 1)])
+def test_normals_of_a_hull_wait_for_the_light(dataset, two_sided, normals_start, part):
+    """Adam's first step is as long as its rate, where there is a gradient. Random normals have nothing to wait with."""
+    learned = model()
+    learned.two_sided = two_sided
+    settings = replace(SETTINGS, normals_start=normals_start, sh_start=1.0)
+    fit, before = Fit(dataset, learned, settings, 1.0), {k: learned.numpy(k) for k in ("rotations", "centers")}
+    fit.step()
+    moved = {k: np.abs(learned.numpy(k) - value).max() for k, value in before.items()}
+    assert moved["rotations"] == pytest.approx(part * 2e-3, rel=0.01) and moved["centers"] == pytest.approx(5e-4, rel=0.01)
+    fit.step_number = 8  # of 40
+    fit._set_rates()
+    assert fit.model.optimizer.learning_rate("rotations") == pytest.approx(2e-3 * 0.1**0.2)
+
+
+@pytest.mark.parametrize("cooldown, parts", [(0.25, [1, 1, 0.5, 0.1]), (0.0, [1, 1, 1, 1])])
+def test_rates_fall_to_zero_in_the_end(dataset, cooldown, parts):
+    fit = Fit(dataset, model(), replace(SETTINGS, cooldown=cooldown), 1.0)
+    for fit.step_number, part in zip((20, 30, 35, 39), parts):
+        fit._set_rates()
+        for name, (first, last) in (("centers", (5e-4, 1e-5)), ("log_environment", (6e-2, 5e-3))):
+            rate = first * (last / first) ** (fit.step_number / 40)
+            assert fit.model.optimizer.learning_rate(name) == pytest.approx(part * rate)
+
+
+def test_a_light_that_is_given_keeps_its_rows(dataset):
+    given = replace(SETTINGS, refine_start=0.0, rates=Rates(environment=(0.0, 0.0)))
+    fit = Fit(dataset, model(), given, 1.0, Shading("split_sum"))
+    fit.step()
+    np.testing.assert_array_equal(fit.model.numpy("log_environment"), model().numpy("log_environment"))
+
+
+@pytest.mark.parametrize("refine_start, downscale, most, rows", [
+    (0.5, 1, 512, 64), (0.6, 1, 512, 16), (0.5, 2, 512, 32), (0.5, 4, 512, 16), (0.5, 1, 63, 32)])
+def test_environment_gets_the_rows_that_photographs_tell_apart(dataset, monkeypatch, refine_start, downscale, most, rows):
+    """A mirror ball whose radius is 3/8 of 83 pixels has 49 of them from pole to pole (π r/2)."""
+    monkeypatch.setattr(fit_module, "_MOST_ROWS", most)
+    settings = replace(SETTINGS, refine_start=refine_start, stages=(Stage(1.0, downscale, 1),), indirect="none")
+    fit = Fit(dataset, model(), settings, 1.0, Shading("split_sum"))
+    fit.step_number = 19  # of 40
+    fit.step()
+    assert fit.model["log_environment"].shape == (16, 32, 3)
+    fit.step()
+    assert fit.model["log_environment"].shape == (rows, 2 * rows, 3)
+    resumed = Fit.resume(dataset, settings, *fit.state(), shading=Shading("split_sum"))
+    before = resumed.model.numpy("log_environment")
+    resumed.step()
+    moved = np.abs(resumed.model.numpy("log_environment") - before).max()
+    assert before.shape[0] == rows and 0 < moved < 0.1
+
+
+def test_a_finer_environment_goes_on_with_the_moments_that_it_would_have():
+    """Those of Adam after a constant derivative: itself and its square."""
+    theta, phi = np.meshgrid(np.linspace(0.2, np.pi - 0.2, 1500), (np.arange(3000) + 0.5) / 3000 * 2 * np.pi, indexing="ij")
+    d = mi.Vector3f(*(x.ravel() for x in (np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi))))
+    learned, seen = model(), []
+    for _ in range(2):
+        logarithm = learned["log_environment"]
+        dr.enable_grad(logarithm)
+        radiance = learned.environment().unfiltered().eval(d)
+        dr.backward(dr.mean(dr.sum(radiance * dr.square(1.5 + d.x * mi.Color3f(0.1, 0.3, 0.5)))))
+        gradient = dr.grad(logarithm).numpy()
+        t, m, v, _ = learned.optimizer.state["log_environment"][3]
+        seen.append((gradient, m.numpy().reshape(gradient.shape), v.numpy().reshape(gradient.shape), int(np.ravel(t)[0])))
+        learned._set_moments("log_environment", mi.UInt32(7), lanes(gradient), lanes(gradient**2))
+        learned.refine_environment()
+    (_, _, _, before), (gradient, m, v, after) = seen
+    inner = slice(4, -4)  # no lookups near the poles
+    np.testing.assert_allclose(m[inner], gradient[inner], rtol=0.06)
+    np.testing.assert_allclose(v[inner], gradient[inner] ** 2, rtol=0.12)
+    assert (before, after) == (0, 7)
+
+
+@pytest.mark.parametrize("where, opacity", [("hull", 0.7), ("points", 0.7), ("anywhere", 0.1)])
+def test_opacities_to_start_with(dataset, where, opacity):
+    points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    data = replace(dataset, points=points if where == "points" else None)
+    scene = SimpleNamespace(shading=Shading(), environment=model().environment())
+    settings = replace(SETTINGS, start=Start(surfels=50, hull=where == "hull"), weights=Weights(depth=0))
+    surfels = start(scene, data, settings).model.surfels(0)
+    np.testing.assert_allclose(surfels.opacities.numpy(), opacity, rtol=1e-5)
+    settings = replace(settings, start=replace(settings.start, opacity=0.4))
+    np.testing.assert_allclose(start(scene, data, settings).model.surfels(0).opacities.numpy(), 0.4, rtol=1e-5)
+
+
+@pytest.mark.parametrize("changes, surfels", [({"minutes": 8.0}, 50_000), ({"minutes": 30.0}, 150_000), (
+    {"minutes": None, "iterations": 10**6}, 50_000), ({"minutes": 30.0, "density": Density(max_surfels=7)}, 7)])
+def test_surfels_for_the_time(changes, surfels):
+    assert replace(Settings(), **changes).max_surfels == surfels

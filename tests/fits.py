@@ -1,0 +1,42 @@
+"""A model and photographs of random surfels, which several tests fit."""
+
+from pathlib import Path
+
+import numpy as np
+
+from rgs_mi.datasets.types import Dataset, View
+from rgs_mi.fit import losses
+from rgs_mi.fit.model import Model
+from rgs_mi.settings.settings import Density, Settings, Stage, Start
+from rgs_mi.shading import deferred
+from rgs_mi.shading.split_sum import SplitSum
+from rgs_mi.surfels.surfels import Surfels
+
+from scenes import orbit_camera, sphere_surfels
+
+SETTINGS = Settings(minutes=None, iterations=40, stages=(Stage(1.0, 1, 1),), start=Start(surfels=300),
+                    density=Density(start=1.0))
+
+
+def model(seed=0):
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(300, 3))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return Model.start(x, x, np.full((300, 3), 0.3), np.full(300, 0.15), np.full((16, 32, 3), 0.5), np.eye(3), 1)
+
+
+def random_photographs() -> Dataset:
+    """Six photographs of random surfels, of odd size and off centre."""
+    truth = sphere_surfels(300, seed=2, scale=0.9, opacity_shift=4)
+    truth = Surfels.from_numpy(truth.numpy(), two_sided=False)
+    light = model()
+    views = []
+    for k in range(6):
+        camera = orbit_camera(k, size=(83, 75), distance=9.0)
+        image = deferred.render(truth, camera, deferred.Lighting(SplitSum(light.environment().filtered())))
+        alpha = image.gbuffer.all.alpha.numpy().reshape(75, 83, 1)
+        shown = losses.display(image.color, image.gbuffer.all.alpha, 0.0).numpy().T.reshape(75, 83, 3)
+        straight = shown / np.maximum(alpha, 1e-3)
+        pixels = np.clip(np.concatenate([straight, alpha], 2) * 255 + 0.5, 0, 255).astype(np.uint8)
+        views.append(View(f"r_{k}", camera, pixels, True, None, Path(f"r_{k}.png")))
+    return Dataset(views, [])

@@ -1,0 +1,144 @@
+"""The tiled splatter against its slow twin, and its gradients against finite differences."""
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from rgs_mi.splat import gbuffer
+from rgs_mi.splat.reference import render_gbuffer_reference
+from rgs_mi.splat.tiles import Cutoffs
+from rgs_mi.surfels.surfels import CHANNELS, Surfels
+
+from scenes import layered_surfels, orbit_camera, sphere_surfels, tangent_surfels
+
+MAPS = ("diffuse", "normal", "base_color", "roughness", "metallic", "delta_normal", "depth", "square", "alpha")
+SORTED = Cutoffs(window=96)  # more than the surfels of any tile here that overlap
+SMOOTH = Cutoffs(alpha_min=1e-7, alpha_max=0.9999, transmittance_min=0, window=96)
+
+
+def render_gbuffer(surfels, camera, cutoffs=Cutoffs()):
+    return gbuffer.render_gbuffer(surfels, camera, cutoffs=cutoffs, full=True).all
+
+
+def stacked(maps):
+    """All maps as one array [K, pixels]."""
+    return np.concatenate([np.atleast_2d(getattr(maps, name).numpy()) for name in MAPS])
+
+
+def inner(maps, weights):
+    """<weights, maps> as a Dr.Jit scalar."""
+    columns = [c for name in MAPS for c in (getattr(maps, name) if name in
+               ("diffuse", "normal", "base_color", "delta_normal") else [getattr(maps, name)])]
+    return sum(dr.sum(c * mi.Float(w)) for c, w in zip(columns, weights))
+
+
+def gradients(render, surfels, camera, weights):
+    for name in CHANNELS:
+        dr.enable_grad(getattr(surfels, name))
+    dr.backward(inner(render(surfels, camera, cutoffs=SMOOTH), weights))
+    result = {name: dr.grad(getattr(surfels, name)).numpy() for name in CHANNELS}
+    for name in CHANNELS:
+        dr.disable_grad(getattr(surfels, name))
+    return result
+
+
+@pytest.mark.parametrize("camera", [
+    orbit_camera(), orbit_camera(2.0, (37, 53)), orbit_camera(1.0, (64, 64), distance=1.6),
+    replace(orbit_camera(0.7), principal=(11.0, 31.0)), replace(orbit_camera(0.2), focal=(90.0, 50.0)),
+], ids=["plain", "odd size", "inside reach", "principal point", "anisotropic pixels"])
+@pytest.mark.parametrize("count", [40, 300])
+def test_forward_equals_reference(camera, count):
+    surfels = sphere_surfels(count, seed=count)
+    mine, reference = (stacked(f(surfels, camera, SORTED)) for f in (render_gbuffer, render_gbuffer_reference))
+    # A weight within rounding of the cut-off may fall on either side of it: those few pixels differ by at most 1/255.
+    difference = np.abs(mine - reference)
+    assert (difference > 2e-3 * max(1, np.abs(reference).max())).mean() == 0
+    assert (difference > 1e-4).mean() < 2e-3
+    assert reference[-1].max() > 0.5
+
+
+def test_backward_equals_reference():
+    surfels, camera = sphere_surfels(30, seed=3), orbit_camera(size=(32, 24))
+    weights = np.random.default_rng(0).normal(size=(17, 32 * 24)).astype(np.float32)
+    mine = gradients(render_gbuffer, surfels, camera, weights)
+    reference = gradients(render_gbuffer_reference, surfels, camera, weights)
+    for name in CHANNELS:
+        scale = np.abs(reference[name]).max()
+        assert scale > 0, name
+        assert np.abs(mine[name] - reference[name]).max() < 1e-3 * scale, name
+
+
+def test_window_brings_tiles_into_order():
+    """A surface whose surfels are as far apart as its pixels: what is left of the tiles' grid is faint."""
+    surfels, camera = replace(sphere_surfels(20_000), two_sided=False), orbit_camera(size=(96, 96))
+
+    def image(shift, window):
+        maps = render_gbuffer(surfels, camera.cropped(-shift, -shift, 104, 104), Cutoffs(window=window))
+        return stacked(maps).reshape(17, 104, 104)[:, shift:shift + 96, shift:shift + 96]
+
+    seams = {window: np.square(image(0, window) - image(4, window)).mean() for window in (1, 16)}
+    assert 0 < seams[16] < 0.1 * seams[1], seams
+
+
+def test_curved_surfels_have_the_normals_of_a_sphere():
+    """Surfels that touch a unit sphere: with its curvature they show its normals many times as well as without."""
+    camera = orbit_camera(size=(96, 96))
+    directions = camera.rays().reshape(-1, 3)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    closest = -directions @ camera.origin
+    inside = 1 - ((camera.origin + closest[:, None] * directions)**2).sum(1)
+    seen = inside > 0.2  # away from the silhouette
+    true = camera.origin + (closest - np.sqrt(np.maximum(inside, 0)))[:, None] * directions
+
+    def degrees(curvature):
+        normal = render_gbuffer(tangent_surfels(400, curvature), camera).normal.numpy().T
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-6)
+        return np.degrees(np.arccos(np.clip((normal * true).sum(1)[seen], -1, 1))).mean()
+
+    assert 4 * degrees([1, 0, 1]) < degrees([0, 0, 0])
+    assert degrees([-1, 0, -1]) > degrees([0, 0, 0])  # the sign matters
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", CHANNELS)
+def test_gradients_equal_finite_differences(name, seed):
+    camera = orbit_camera(size=(24, 24))
+    base = layered_surfels(camera, seed).numpy()
+    weights = np.random.default_rng(1).normal(size=(17, 24 * 24)).astype(np.float32)
+    gradient = gradients(render_gbuffer, Surfels.from_numpy(base), camera, weights)[name].astype(np.float64)
+    # Uphill in every number, or what they add would cancel and leave rounding to compare
+    direction = np.copysign(np.random.default_rng(2).normal(size=base[name].shape), gradient) * np.abs(base[name]).mean()
+
+    def value(step):
+        moved = Surfels.from_numpy({**base, name: base[name] + step * direction})
+        return float((stacked(render_gbuffer(moved, camera, cutoffs=SMOOTH)).astype(np.float64) * weights).sum())
+
+    h = 2e-3 if name in ("centers", "rotations", "scales") else 2e-2  # in the others the image is a polynomial
+    central = lambda h: (value(h) - value(-h)) / (2 * h)
+    expected = (4 * central(h) - central(2 * h)) / 3  # Richardson: the h² term of the central difference cancels
+    assert (gradient * direction).sum() == pytest.approx(expected, rel=1e-3)
+
+
+def test_forward_mode_equals_backward_mode():
+    surfels, camera = sphere_surfels(20, seed=7), orbit_camera(size=(16, 16))
+    weights = np.random.default_rng(1).normal(size=(17, 256)).astype(np.float32)
+    gradient = gradients(render_gbuffer, surfels, camera, weights)
+    rng = np.random.default_rng(3)
+    expected = 0.0
+    for name in CHANNELS:
+        tangent = rng.normal(size=gradient[name].shape).astype(np.float32)
+        expected += float((tangent * gradient[name]).sum())
+        dr.enable_grad(getattr(surfels, name))
+        dr.set_grad(getattr(surfels, name), mi.TensorXf(tangent))
+    value = inner(render_gbuffer(surfels, camera, cutoffs=SMOOTH), weights)
+    dr.forward_to(value)
+    assert dr.grad(value)[0] == pytest.approx(expected, rel=1e-3)
+
+
+def test_nothing_to_draw():
+    surfels, camera = sphere_surfels(5), orbit_camera()
+    behind = replace(camera, to_world=camera.to_world @ np.diag([1, -1, -1, 1]))
+    assert np.all(stacked(render_gbuffer(surfels, behind)) == 0)
