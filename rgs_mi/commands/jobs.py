@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..core.errors import UserError
+from ..core.files import atomic_file
 from ..datasets import is_capture, looked_for
 from ..fit import checkpoint
 from ..fit.scene import FitScene
@@ -101,7 +102,7 @@ def check_photographs(folder, digest):
     path = folder / _DIGEST
     if path.is_file() and path.read_text().strip() != digest:
         raise UserError(f"{folder} holds fits to other photographs: delete it, or choose another --out")
-    with checkpoint.atomic_file(path) as stream:
+    with atomic_file(path) as stream:
         stream.write(f"{digest}\n".encode())
 
 
@@ -144,6 +145,6 @@ def write_tables(out, name, sections, rows, told) -> list[Path]:
     for suffix, text in {"md": "\n\n".join(sections) + "\n", "csv": lines.getvalue(),
                          "json": json.dumps({"runs": rows} | told, indent=1) + "\n"}.items():
         paths.append(Path(out) / f"{name}.{suffix}")
-        with checkpoint.atomic_file(paths[-1]) as stream:
+        with atomic_file(paths[-1]) as stream:
             stream.write(text.encode())
     return paths

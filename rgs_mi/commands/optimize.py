@@ -11,6 +11,7 @@ import numpy as np
 
 from ..core.bounding_box import Box
 from ..core.errors import UserError
+from ..core.files import make_folder
 from ..core.interrupt import GracefulInterrupt
 from ..core.progress import Progress
 from ..fit import checkpoint
@@ -50,7 +51,7 @@ def optimize(path, *, data=None, variables=None, config=None, overrides=(), minu
     saved = _saved(folder, resume)
     events = Events(folder / "tensorboard", saved[1]["step"] if saved else 0) if tensorboard else None
     dataset = scene.dataset(quiet)
-    checkpoint.make_folder(folder)
+    make_folder(folder)
     fit = _resume(saved, scene, dataset, settings) if saved else start(scene, dataset, settings, quiet)
     stopped = _loop(fit, folder, quiet, events)
     results.write(fit, scene, folder, quiet)

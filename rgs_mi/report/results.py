@@ -12,10 +12,10 @@ import mitsuba as mi
 import numpy as np
 
 from .. import __version__, report
+from ..core.files import atomic_file
 from ..core.progress import Progress
 from ..evaluation import evaluate, lpips, pictures
 from ..export.mitsuba_scene import export
-from ..fit import checkpoint
 from ..settings.config import to_dict
 
 METRICS, SHEET, GUIDED = "metrics.json", "contact_sheet.png", "guided.png"
@@ -70,7 +70,7 @@ def measure(surfels, lighting, dataset, background, spp, folder, quiet) -> tuple
 def publish(folder, figures, curves, rows, environment, others=()):
     """Write metrics.json, contact sheet and report into ``folder``, and print what came out and where it is, the paths
     ``others`` among it. ``figures``: what metrics.json holds; ``curves``, ``rows``: see `report.write`."""
-    with checkpoint.atomic_file(folder / METRICS) as stream:
+    with atomic_file(folder / METRICS) as stream:
         stream.write((json.dumps(figures, indent=1, default=str) + "\n").encode())
     lines, texels = _summary(figures), environment.texels.numpy()
     pictures.contact_sheet(folder / SHEET, list(rows.values()), texels, folder.resolve().name, lines)
