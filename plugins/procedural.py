@@ -49,9 +49,15 @@ def procedural_envmap(props):
         pixels = environments.constant(float(props.get("radiance", 0.5)), int(props.get("rows", 128)))
     else:
         pixels = environments.environment(str(props["name"]), int(props.get("resolution", 512)))
-    return mi.load_dict({"type": "envmap", "id": props.id(), "bitmap": mi.Bitmap(pixels),
-                         "scale": float(props.get("scale", 1.0)),
-                         "to_world": props.get("to_world", mi.ScalarTransform4f())})
+    return mi.load_dict(
+        {
+            "type": "envmap",
+            "id": props.id(),
+            "bitmap": mi.Bitmap(pixels),
+            "scale": float(props.get("scale", 1.0)),
+            "to_world": props.get("to_world", mi.ScalarTransform4f()),
+        }
+    )
 
 
 mi.register_shape("procedural_mesh", procedural_mesh)

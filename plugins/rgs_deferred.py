@@ -75,8 +75,16 @@ from rgs_mi.shading.shader import Shader
 from rgs_mi.shading.split_sum import SplitSum
 from rgs_mi.surfels.proxies import Proxies
 
-AOVS = {"depth": "T", "normal": "XYZ", "albedo": "RGB", "roughness": "Y", "metallic": "Y", "alpha": "Y",
-        "specular": "RGB", "diffuse": "RGB"}
+AOVS = {
+    "depth": "T",
+    "normal": "XYZ",
+    "albedo": "RGB",
+    "roughness": "Y",
+    "metallic": "Y",
+    "alpha": "Y",
+    "specular": "RGB",
+    "diffuse": "RGB",
+}
 ESTIMATORS = ("split_sum", "monte_carlo", "none")
 DIFFUSE = ("radiance", "lit")
 
@@ -197,8 +205,15 @@ def _aov(name, image, maps, camera, rays):
     if name == "depth":
         forward = mi.Vector3f(*[dr.opaque(mi.Float, float(v)) for v in camera.rotation[2]])
         return [maps.depth / dr.dot(rays, forward)]
-    value = {"normal": maps.normal, "albedo": maps.base_color, "roughness": maps.roughness, "metallic": maps.metallic,
-             "alpha": maps.alpha, "specular": image.specular, "diffuse": image.diffuse}[name]
+    value = {
+        "normal": maps.normal,
+        "albedo": maps.base_color,
+        "roughness": maps.roughness,
+        "metallic": maps.metallic,
+        "alpha": maps.alpha,
+        "specular": image.specular,
+        "diffuse": image.diffuse,
+    }[name]
     return [value] if isinstance(value, mi.Float) else [*value]
 
 

@@ -108,8 +108,9 @@ class SurfelShape(mi.Mesh):
         for name, shape in shapes.items():
             expected = (CHANNELS[name],) if CHANNELS[name] else (3, 12, 27, 48)
             if len(shape) != 2 or shape[1] not in expected:
-                raise UserError(f"surfels '{self.id()}': '{name}' has shape {shape}: "
-                                f"needs [N, {' or '.join(map(str, expected))}]")
+                raise UserError(
+                    f"surfels '{self.id()}': '{name}' has shape {shape}: needs [N, {' or '.join(map(str, expected))}]"
+                )
 
     def _rebuild(self):
         """Geometry of the mesh: the proxies, or a diagonal of their bounding box."""

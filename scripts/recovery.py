@@ -12,11 +12,13 @@ from rgs_mi.core.errors import listed, run_main
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path, help="a run's folder")
-    parser.add_argument("truth", type=Path, metavar="TRUTH.xml", help="the scene of its photographs, e.g. "
-                        "scenes/targets/helmet.xml")
+    parser.add_argument(
+        "truth", type=Path, metavar="TRUTH.xml", help="the scene of its photographs, e.g. scenes/targets/helmet.xml"
+    )
     parser.add_argument("--lights", type=listed(), default=[], metavar="A,B", help="environments of the suite to relight it")
-    parser.add_argument("--size", type=int, default=400, help="pixels along a side of the path-traced views "
-                        "(default: %(default)s)")
+    parser.add_argument(
+        "--size", type=int, default=400, help="pixels along a side of the path-traced views (default: %(default)s)"
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to (default: recovery in the run's folder)")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
     parser.add_argument("--quiet", action="store_true", help="no progress")

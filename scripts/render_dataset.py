@@ -15,11 +15,16 @@ def main():
     parser.add_argument("--train", type=int, default=60, help="training views (default: %(default)s)")
     parser.add_argument("--test", type=int, default=20, help="test views (default: %(default)s)")
     parser.add_argument("--size", type=int, default=400, help="pixels along a side (default: %(default)s)")
-    parser.add_argument("--spp", type=int, default=25,
-                        help="samples per pixel of training views, test views take 4 times that (default: %(default)s)")
+    parser.add_argument(
+        "--spp",
+        type=int,
+        default=25,
+        help="samples per pixel of training views, test views take 4 times that (default: %(default)s)",
+    )
     parser.add_argument("--radius", type=float, help="distance of the cameras (default: the object fills the frame)")
-    parser.add_argument("-D", dest="define", action="append", default=[], metavar="NAME=VALUE",
-                        help="a variable of the scene")
+    parser.add_argument(
+        "-D", dest="define", action="append", default=[], metavar="NAME=VALUE", help="a variable of the scene"
+    )
     parser.add_argument("--seed", type=int, default=0, help="turns the cameras and reseeds the sampler")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
@@ -28,9 +33,18 @@ def main():
     rgs_mi.set_variant(args.variant)
     from rgs_mi.datasets.path_traced import render_dataset
 
-    out = render_dataset(args.scene, args.out or Path("data") / args.scene.stem, train=args.train, test=args.test,
-                         size=args.size, spp=args.spp, radius=args.radius, variables=parse_variables(args.define),
-                         seed=args.seed, quiet=args.quiet)
+    out = render_dataset(
+        args.scene,
+        args.out or Path("data") / args.scene.stem,
+        train=args.train,
+        test=args.test,
+        size=args.size,
+        spp=args.spp,
+        radius=args.radius,
+        variables=parse_variables(args.define),
+        seed=args.seed,
+        quiet=args.quiet,
+    )
     print(out)
 
 

@@ -12,8 +12,15 @@ import time
 from pathlib import Path
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-_OPTIONS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
-            "--remote-debugging-pipe", "--hide-scrollbars")
+_OPTIONS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-dev-shm-usage",
+    "--no-first-run",
+    "--remote-debugging-pipe",
+    "--hide-scrollbars",
+)
 _START = """import os, sys
 os.dup2(int(sys.argv[1]), 3)
 os.dup2(int(sys.argv[2]), 4)
@@ -39,8 +46,9 @@ class Browser:
         self._in, theirs_out = os.pipe()
         command = [self.program, *_OPTIONS, f"--user-data-dir={self._folder.name}", "about:blank"]
         start = [sys.executable, "-c", _START, str(theirs_in), str(theirs_out), *command]
-        self._process = subprocess.Popen(start, pass_fds=(theirs_in, theirs_out), stdout=subprocess.DEVNULL,
-                                         stderr=subprocess.DEVNULL)
+        self._process = subprocess.Popen(
+            start, pass_fds=(theirs_in, theirs_out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         os.close(theirs_in)
         os.close(theirs_out)
         self._waiting, self._number, self._session = b"", 0, None
@@ -65,7 +73,7 @@ class Browser:
             message["sessionId"] = self._session
         data = json.dumps(message).encode() + b"\0"
         while data:
-            data = data[os.write(self._out, data):]
+            data = data[os.write(self._out, data) :]
         while (answer := self._receive()).get("id") != self._number:
             self._note(answer)
         assert "error" not in answer, f"{method}: {answer['error']}"
@@ -92,8 +100,11 @@ class Browser:
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.send("Emulation.setEmulatedMedia", features=[scheme])
         height = height or self.run("document.documentElement.scrollHeight")
-        image = self.send("Page.captureScreenshot", captureBeyondViewport=True,
-                          clip={"x": 0, "y": 0, "width": width, "height": height, "scale": 1})
+        image = self.send(
+            "Page.captureScreenshot",
+            captureBeyondViewport=True,
+            clip={"x": 0, "y": 0, "width": width, "height": height, "scale": 1},
+        )
         Path(path).write_bytes(base64.b64decode(image["data"]))
 
     def resize(self, width, height=900):

@@ -22,8 +22,16 @@ _GREY = 0.2
 def poses(count=9):
     """[count, 4, 4] camera to world (x right, y down, z forward): from +x, at distance 4, each with a roll of its own."""
     angles = zip(np.linspace(-0.5, 0.5, count), np.linspace(0.4, -0.3, count))
-    return [Camera.look_at((4 * np.cos(a) * np.cos(b), 4 * np.sin(a) * np.cos(b), 4 * np.sin(b)), (0, 0.05, 0.02),
-                           (0, a / 2 + 0.1, 1), 50, SIZE).to_world for a, b in angles]
+    return [
+        Camera.look_at(
+            (4 * np.cos(a) * np.cos(b), 4 * np.sin(a) * np.cos(b), 4 * np.sin(b)),
+            (0, 0.05, 0.02),
+            (0, a / 2 + 0.1, 1),
+            50,
+            SIZE,
+        ).to_world
+        for a, b in angles
+    ]
 
 
 def distort(xy, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.0, k5=0.0, k6=0.0, poly4=0.0):
@@ -31,8 +39,9 @@ def distort(xy, k1=0.0, k2=0.0, p1=0.0, p2=0.0, k3=0.0, k4=0.0, k5=0.0, k6=0.0, 
     x, y = xy.T
     r = x**2 + y**2
     radial = (1 + k1 * r + k2 * r**2 + k3 * r**3 + poly4 * r**4) / (1 + k4 * r + k5 * r**2 + k6 * r**3)
-    return np.stack([x * radial + 2 * p1 * x * y + p2 * (r + 2 * x**2),
-                     y * radial + p1 * (r + 2 * y**2) + 2 * p2 * x * y], -1)
+    return np.stack(
+        [x * radial + 2 * p1 * x * y + p2 * (r + 2 * x**2), y * radial + p1 * (r + 2 * y**2) + 2 * p2 * x * y], -1
+    )
 
 
 def photograph(to_world, scale=1, **lens):
@@ -42,14 +51,16 @@ def photograph(to_world, scale=1, **lens):
     x, y = np.meshgrid(*(np.arange(round(n * scale)) + 0.5 for n in SIZE))
     image = np.full((*x.shape, 3), _GREY, np.float32)
     for (u, v), color in zip(pixel, srgb_decode(COLORS / 255)):
-        image += np.exp(-((x - u)**2 + (y - v)**2) / 2)[..., None] * (color - _GREY)
+        image += np.exp(-((x - u) ** 2 + (y - v) ** 2) / 2)[..., None] * (color - _GREY)
     return image
 
 
 def photographs(count=9, **options):
     """name -> [H, W, 3] uint8 of `poses`."""
-    return {f"v{i:02d}": np.rint(255 * srgb_encode(np.clip(photograph(pose, **options), 0, 1))).astype(np.uint8)
-            for i, pose in enumerate(poses(count))}
+    return {
+        f"v{i:02d}": np.rint(255 * srgb_encode(np.clip(photograph(pose, **options), 0, 1))).astype(np.uint8)
+        for i, pose in enumerate(poses(count))
+    }
 
 
 def check_dots(view, at_least=5, tolerance=0.12):
@@ -61,10 +72,10 @@ def check_dots(view, at_least=5, tolerance=0.12):
     assert seen.sum() >= at_least
     for (u, v), color in zip(pixel[seen], srgb_decode(COLORS / 255)[seen]):
         column, row = int(u) - 4, int(v) - 4
-        window = linear[row:row + 9, column:column + 9] - _GREY
-        weight = window @ (color - _GREY) / np.sum((color - _GREY)**2)
+        window = linear[row : row + 9, column : column + 9] - _GREY
+        weight = window @ (color - _GREY) / np.sum((color - _GREY) ** 2)
         assert 4.5 < weight.sum() < 8, "no dot there"  # 2 pi for sigma 1
-        y, x = np.mgrid[row:row + 9, column:column + 9] + 0.5
+        y, x = np.mgrid[row : row + 9, column : column + 9] + 0.5
         found = np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
         np.testing.assert_allclose(found, [u, v], atol=tolerance)
 
@@ -92,14 +103,17 @@ def write_png16(path, grey):
 
 # ---- Layouts ----
 
+
 def intrinsics():
     return dict(zip(("fl_x", "fl_y", "cx", "cy", "w", "h"), (*FOCAL, *PRINCIPAL, *SIZE)))
 
 
 def frames(images, folder="images", suffix=".png"):
     """The frames of a transforms file."""
-    return [{"file_path": f"{folder}/{name}{suffix}", "transform_matrix": (pose @ _GL_TO_CV).tolist()}
-            for name, pose in zip(images, poses(len(images)))]
+    return [
+        {"file_path": f"{folder}/{name}{suffix}", "transform_matrix": (pose @ _GL_TO_CV).tolist()}
+        for name, pose in zip(images, poses(len(images)))
+    ]
 
 
 def write_blender(root, images):
@@ -119,12 +133,20 @@ def write_nerfstudio(root, images, entries=None, **meta):
     return root
 
 
-MODEL_NUMBERS = {"SIMPLE_PINHOLE": 0, "PINHOLE": 1, "SIMPLE_RADIAL": 2, "RADIAL": 3, "OPENCV": 4, "OPENCV_FISHEYE": 5,
-                 "FULL_OPENCV": 6}
+MODEL_NUMBERS = {
+    "SIMPLE_PINHOLE": 0,
+    "PINHOLE": 1,
+    "SIMPLE_RADIAL": 2,
+    "RADIAL": 3,
+    "OPENCV": 4,
+    "OPENCV_FISHEYE": 5,
+    "FULL_OPENCV": 6,
+}
 
 
-def write_colmap(root, images, model="PINHOLE", parameters=(*FOCAL, *PRINCIPAL), suffix=".bin", folder="sparse/0",
-                 type=".png", size=SIZE):
+def write_colmap(
+    root, images, model="PINHOLE", parameters=(*FOCAL, *PRINCIPAL), suffix=".bin", folder="sparse/0", type=".png", size=SIZE
+):
     """The model of `poses`, with one camera, keypoints in every other image, and the points `POINTS`."""
     target = root / folder
     target.mkdir(parents=True, exist_ok=True)
@@ -134,22 +156,40 @@ def write_colmap(root, images, model="PINHOLE", parameters=(*FOCAL, *PRINCIPAL),
         x, y, z, w = Rotation.from_matrix(turn).as_quat()
         records.append((w, x, y, z, *move))
     if suffix == ".bin":
-        (target / "cameras.bin").write_bytes(struct.pack("<QiiQQ", 1, 7, MODEL_NUMBERS[model], *size)
-                                             + struct.pack(f"<{len(parameters)}d", *parameters))
-        (target / "images.bin").write_bytes(struct.pack("<Q", len(images)) + b"".join(
-            struct.pack("<I7dI", i + 1, *record, 7) + f"{name}{type}".encode() + b"\0" + struct.pack("<Q", i % 2)
-            + struct.pack("<ddq", 1.5, 2.5, -1) * (i % 2) for i, (name, record) in enumerate(zip(images, records))))
-        (target / "points3D.bin").write_bytes(struct.pack("<Q", len(POINTS)) + b"".join(
-            struct.pack("<Q3d3BdQ", i, *p, *c, 0.5, 0) for i, (p, c) in enumerate(zip(POINTS, COLORS))))
+        (target / "cameras.bin").write_bytes(
+            struct.pack("<QiiQQ", 1, 7, MODEL_NUMBERS[model], *size) + struct.pack(f"<{len(parameters)}d", *parameters)
+        )
+        (target / "images.bin").write_bytes(
+            struct.pack("<Q", len(images))
+            + b"".join(
+                struct.pack("<I7dI", i + 1, *record, 7)
+                + f"{name}{type}".encode()
+                + b"\0"
+                + struct.pack("<Q", i % 2)
+                + struct.pack("<ddq", 1.5, 2.5, -1) * (i % 2)
+                for i, (name, record) in enumerate(zip(images, records))
+            )
+        )
+        (target / "points3D.bin").write_bytes(
+            struct.pack("<Q", len(POINTS))
+            + b"".join(struct.pack("<Q3d3BdQ", i, *p, *c, 0.5, 0) for i, (p, c) in enumerate(zip(POINTS, COLORS)))
+        )
     else:
         number = lambda values: " ".join(map(repr, map(float, values)))
-        (target / "cameras.txt").write_text("# Camera list\n# Number of cameras: 1\n"
-                                            f"7 {model} {size[0]} {size[1]} {number(parameters)}\n")
-        (target / "images.txt").write_text("# Image list\n" + "".join(
-            f"{i + 1} {number(record)} 7 {name}{type}\n{'1.5 2.5 -1' * (i % 2)}\n"
-            for i, (name, record) in enumerate(zip(images, records))))
-        (target / "points3D.txt").write_text("# 3D point list\n" + "".join(
-            f"{i} {number(p)} {c[0]} {c[1]} {c[2]} 0.5\n" for i, (p, c) in enumerate(zip(POINTS, COLORS))))
+        (target / "cameras.txt").write_text(
+            f"# Camera list\n# Number of cameras: 1\n7 {model} {size[0]} {size[1]} {number(parameters)}\n"
+        )
+        (target / "images.txt").write_text(
+            "# Image list\n"
+            + "".join(
+                f"{i + 1} {number(record)} 7 {name}{type}\n{'1.5 2.5 -1' * (i % 2)}\n"
+                for i, (name, record) in enumerate(zip(images, records))
+            )
+        )
+        (target / "points3D.txt").write_text(
+            "# 3D point list\n"
+            + "".join(f"{i} {number(p)} {c[0]} {c[1]} {c[2]} 0.5\n" for i, (p, c) in enumerate(zip(POINTS, COLORS)))
+        )
     for name, pixels in images.items():
         save(root / "images" / f"{name}{type}", pixels)
     return root

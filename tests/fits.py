@@ -14,8 +14,9 @@ from rgs_mi.surfels.surfels import Surfels
 
 from scenes import orbit_camera, sphere_surfels
 
-SETTINGS = Settings(minutes=None, iterations=40, stages=(Stage(1.0, 1, 1),), start=Start(surfels=300),
-                    density=Density(start=1.0))
+SETTINGS = Settings(
+    minutes=None, iterations=40, stages=(Stage(1.0, 1, 1),), start=Start(surfels=300), density=Density(start=1.0)
+)
 
 
 def model(seed=0):

@@ -14,24 +14,37 @@ def sphere_surfels(n, seed=0, scale=0.6, opacity_shift=1.0, order=1):
     normal = x + 0.1 * rng.normal(size=(n, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     logistic = lambda v: 1 / (1 + np.exp(-v))
-    return Surfels.from_numpy({
-        "centers": x, "rotations": rotation_from_normal(normal, rng.uniform(0, 6, n)),
-        "scales": np.exp(rng.normal(size=(n, 2)) * 0.3) * np.sqrt(4 * np.pi / n) * scale,
-        "opacities": logistic(rng.normal(size=(n, 1)) + opacity_shift),
-        "sh": rng.normal(size=(n, 3 * (order + 1) ** 2)) * 0.1,
-        "base_color": rng.uniform(0.2, 0.9, (n, 3)), "roughness": rng.uniform(0.1, 0.9, (n, 1)),
-        "metallic": rng.uniform(0.1, 0.9, (n, 1)), "delta_normal": rng.normal(size=(n, 3)) * 0.05,
-        "curvature": 0.3 * rng.normal(size=(n, 3))})
+    return Surfels.from_numpy(
+        {
+            "centers": x,
+            "rotations": rotation_from_normal(normal, rng.uniform(0, 6, n)),
+            "scales": np.exp(rng.normal(size=(n, 2)) * 0.3) * np.sqrt(4 * np.pi / n) * scale,
+            "opacities": logistic(rng.normal(size=(n, 1)) + opacity_shift),
+            "sh": rng.normal(size=(n, 3 * (order + 1) ** 2)) * 0.1,
+            "base_color": rng.uniform(0.2, 0.9, (n, 3)),
+            "roughness": rng.uniform(0.1, 0.9, (n, 1)),
+            "metallic": rng.uniform(0.1, 0.9, (n, 1)),
+            "delta_normal": rng.normal(size=(n, 3)) * 0.05,
+            "curvature": 0.3 * rng.normal(size=(n, 3)),
+        }
+    )
 
 
 def tangent_surfels(n, curvature=(0, 0, 0)):
     """``n`` random surfels, all alike, that touch the unit sphere; ``curvature`` in units of the sphere's."""
     scale = 0.6 * np.sqrt(4 * np.pi / n)
     base = sphere_surfels(n).numpy()
-    return Surfels.from_numpy(base | {
-        "rotations": rotation_from_normal(base["centers"]), "delta_normal": np.zeros((n, 3)),
-        "curvature": np.tile(scale * np.array(curvature), (n, 1)), "scales": np.full((n, 2), scale),
-        "opacities": np.full((n, 1), 0.8)}, two_sided=False)
+    return Surfels.from_numpy(
+        base
+        | {
+            "rotations": rotation_from_normal(base["centers"]),
+            "delta_normal": np.zeros((n, 3)),
+            "curvature": np.tile(scale * np.array(curvature), (n, 1)),
+            "scales": np.full((n, 2), scale),
+            "opacities": np.full((n, 1), 0.8),
+        },
+        two_sided=False,
+    )
 
 
 def orbit_camera(angle=0.3, size=(48, 40), distance=4.0, fov=38.0):
@@ -48,6 +61,11 @@ def layered_surfels(camera, seed):
     centers = across[:, :1] * right + across[:, 1:] * down + np.linspace(-1.2, 1.2, n)[:, None] * forward
     normals = 0.1 * rng.normal(size=(n, 3)) - forward
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return Surfels.from_numpy(surfels.numpy() | {
-        "centers": centers, "rotations": rotation_from_normal(normals, rng.uniform(0, 6, n)),
-        "scales": rng.uniform(0.15, 0.3, (n, 2))})
+    return Surfels.from_numpy(
+        surfels.numpy()
+        | {
+            "centers": centers,
+            "rotations": rotation_from_normal(normals, rng.uniform(0, 6, n)),
+            "scales": rng.uniform(0.15, 0.3, (n, 2)),
+        }
+    )

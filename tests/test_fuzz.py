@@ -49,8 +49,10 @@ OPENCV = (*FOCAL, *PRINCIPAL, -0.1, 0.02, 0.01, -0.01)
 
 # ---- What is damaged ----
 
+
 def write_all(root: Path) -> list:
     """(loader, files it reads) of small captures and other files below ``root``."""
+
     def folder(name):
         (root / name).mkdir()
         return root / name
@@ -66,8 +68,16 @@ def write_all(root: Path) -> list:
     write_cloud(blender / "points3d.ply")
 
     entries = [frame | {"mask_path": "masks/m.png"} for frame in frames(images)]
-    studio = write_nerfstudio(folder("nerfstudio"), images, entries, k1=-0.1, k4=0.01, p1=0.01, ply_file_path="cloud.ply",
-                              test_filenames=["images/v01.png"])
+    studio = write_nerfstudio(
+        folder("nerfstudio"),
+        images,
+        entries,
+        k1=-0.1,
+        k4=0.01,
+        p1=0.01,
+        ply_file_path="cloud.ply",
+        test_filenames=["images/v01.png"],
+    )
     save(studio / "masks/m.png", np.dstack([mask] * 3))
     write_cloud(studio / "cloud.ply")
 
@@ -78,10 +88,18 @@ def write_all(root: Path) -> list:
     nero_text = write_nero(folder("protocol0"), images, protocol=0)
 
     rng = np.random.default_rng(0)
-    surfels = {"centers": rng.normal(size=(5, 3)), "rotations": np.tile([0, 0, 0, 1.0], (5, 1)),
-               "scales": np.full((5, 2), 0.1), "opacities": np.full((5, 1), 0.5), "sh": rng.normal(size=(5, 12)),
-               "base_color": np.full((5, 3), 0.5), "roughness": np.full((5, 1), 0.3), "metallic": np.zeros((5, 1)),
-               "delta_normal": np.zeros((5, 3)), "curvature": np.zeros((5, 3))}
+    surfels = {
+        "centers": rng.normal(size=(5, 3)),
+        "rotations": np.tile([0, 0, 0, 1.0], (5, 1)),
+        "scales": np.full((5, 2), 0.1),
+        "opacities": np.full((5, 1), 0.5),
+        "sh": rng.normal(size=(5, 12)),
+        "base_color": np.full((5, 3), 0.5),
+        "roughness": np.full((5, 1), 0.3),
+        "metallic": np.zeros((5, 1)),
+        "delta_normal": np.zeros((5, 3)),
+        "curvature": np.zeros((5, 3)),
+    }
     write_ply(root / "surfels.ply", surfels)
 
     run = folder("run")
@@ -97,12 +115,15 @@ def write_all(root: Path) -> list:
     write_png16(maps / "d3.png", 1000 * depth)
 
     inside = lambda path: sorted(file for file in path.rglob("*") if file.is_file())
-    targets = [(lambda path=path: check_dataset(load_dataset(path)), inside(path))
-               for path in (blender, studio, binary, text, nero, nero_text)]
+    targets = [
+        (lambda path=path: check_dataset(load_dataset(path)), inside(path))
+        for path in (blender, studio, binary, text, nero, nero_text)
+    ]
     return targets + [
         (lambda: check_finite(read_ply(root / "surfels.ply").values()), [root / "surfels.ply"]),
         (lambda: check_checkpoint(checkpoint.load_latest(run)), inside(run)),
-        (lambda: check_depths(depth_files.load(views, maps)), inside(maps))]
+        (lambda: check_depths(depth_files.load(views, maps)), inside(maps)),
+    ]
 
 
 def check_dataset(data):
@@ -135,9 +156,25 @@ def check_depths(priors):
 # ---- How ----
 
 NUMBERS = [b"nan", b"-inf", b"1e999", b"-1", b"0", b"1e-320", b"4294967296", b"9" * 30, b"1e9", b"null", b'"3"', b"[]"]
-WORDS = [struct.pack(kind, value) for kind, value in (
-    ("<Q", 2**64 - 1), ("<Q", 2**40), ("<q", -1), ("<d", float("nan")), ("<d", float("inf")), ("<d", 1e300), ("<d", 0.0),
-    ("<i", -1), ("<I", 2**31), (">I", 65535), (">I", 2**31 - 1), ("<H", 65535), ("<f", float("nan")), ("<f", -1e30))]
+WORDS = [
+    struct.pack(kind, value)
+    for kind, value in (
+        ("<Q", 2**64 - 1),
+        ("<Q", 2**40),
+        ("<q", -1),
+        ("<d", float("nan")),
+        ("<d", float("inf")),
+        ("<d", 1e300),
+        ("<d", 0.0),
+        ("<i", -1),
+        ("<I", 2**31),
+        (">I", 65535),
+        (">I", 2**31 - 1),
+        ("<H", 65535),
+        ("<f", float("nan")),
+        ("<f", -1e30),
+    )
+]
 
 
 def damaged(content: bytes, rng: random.Random) -> bytes:
@@ -156,21 +193,21 @@ def damaged(content: bytes, rng: random.Random) -> bytes:
             case 2:
                 content[at:at] = rng.randbytes(length)
             case 3:
-                del content[at:at + length]
+                del content[at : at + length]
             case 4:
-                content[at:at] = content[at:at + length] * rng.choice([1, 1, 20])
+                content[at:at] = content[at : at + length] * rng.choice([1, 1, 20])
             case 5 | 6 if len(numbers) > 1 and rng.random() < 0.7:
                 one, other = rng.sample(numbers, 2)
-                content[one.start():one.end()] = rng.choice([other.group(), rng.choice(NUMBERS)])
+                content[one.start() : one.end()] = rng.choice([other.group(), rng.choice(NUMBERS)])
             case 5:
                 word = rng.choice(WORDS)
-                content[at:at + len(word)] = word
+                content[at : at + len(word)] = word
             case 6:
                 word = rng.choice(WORDS)
                 at -= at % len(word)
-                content[at:at + len(word)] = word
+                content[at : at + len(word)] = word
             case 7:
-                content[at:at + 1] = rng.choice([b"\0", b"\n", b"\xff", b'"', b"{", b" ", b"."])
+                content[at : at + 1] = rng.choice([b"\0", b"\n", b"\xff", b'"', b"{", b" ", b"."])
     return bytes(content)
 
 
@@ -199,6 +236,7 @@ def run_case(targets, number: int) -> str:
 
 
 # ---- In the suite, and alone ----
+
 
 @pytest.fixture(scope="module")
 def targets(tmp_path_factory):
@@ -231,9 +269,11 @@ def test_files_that_unpack_to_more_than_they_should(tmp_path, monkeypatch):
         checkpoint.load_latest(tmp_path)
 
     view = load_dataset(write_blender(tmp_path, photographs(2))).train[0]
-    for name, write in (("v01.npz", lambda path: np.savez_compressed(path, depth=np.zeros((96, 120)))),
-                        ("v01.exr", lambda path: write_exr(path, np.zeros((96, 120, 3), np.float32))),
-                        ("v01.png", lambda path: write_png16(path, np.ones((96, 120))))):
+    for name, write in (
+        ("v01.npz", lambda path: np.savez_compressed(path, depth=np.zeros((96, 120)))),
+        ("v01.exr", lambda path: write_exr(path, np.zeros((96, 120, 3), np.float32))),
+        ("v01.png", lambda path: write_png16(path, np.ones((96, 120)))),
+    ):
         folder = tmp_path / name[4:]
         folder.mkdir()
         write(folder / name)
@@ -265,8 +305,10 @@ def main(count: int, first: int = 0):
         faulthandler.cancel_dump_traceback_later()
         os.chdir("/")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
-    print(f"\n{count} cases: {json.dumps(outcomes)}, {failures} failures; slowest: case {slowest[1]}, {slowest[0]:.2f} s; "
-          f"peak memory {peak} MiB")
+    print(
+        f"\n{count} cases: {json.dumps(outcomes)}, {failures} failures; slowest: case {slowest[1]}, {slowest[0]:.2f} s; "
+        f"peak memory {peak} MiB"
+    )
     sys.exit(bool(failures))
 
 

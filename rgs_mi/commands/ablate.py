@@ -37,8 +37,16 @@ HULL = ("start.hull=true", "start.carve=false", "rates.rotations=[2e-3,2e-4]")
 #: The shape that photographs agree on, too.
 STEREO = (*HULL, "start.carve=true")
 #: Cross-view shape consistency regularisation; in the paper's loss it stands in the place of 2DGS's own consistency.
-CSCR = (*STEREO, "weights.depth=1e-3", "weights.normal=1e-2", "weights.crease=0", "weights.delta_normal=1e-3",
-        "weights.consistency=[0,0]", "rates.delta_normal=[1e-3,1e-4]", "prior.name=stereo")
+CSCR = (
+    *STEREO,
+    "weights.depth=1e-3",
+    "weights.normal=1e-2",
+    "weights.crease=0",
+    "weights.delta_normal=1e-3",
+    "weights.consistency=[0,0]",
+    "rates.delta_normal=[1e-3,1e-4]",
+    "prior.name=stereo",
+)
 #: Reflection-guided densification.
 RD = ("density.guided=true",)
 
@@ -51,14 +59,20 @@ VARIANTS = {
     "rd": Variant("+ RD", "deferred2dgs", RD),
     "full": Variant("full: + CSCR + RD", "deferred2dgs", CSCR + RD),
     "fast": Variant("fast: the defaults", "fast"),
-    "lean": Variant("full, at most 11 000 surfels", "deferred2dgs",
-                    (*CSCR, *RD, "start.surfels=8000", "density.max_surfels=11000"), "baseline", 2),
+    "lean": Variant(
+        "full, at most 11 000 surfels",
+        "deferred2dgs",
+        (*CSCR, *RD, "start.surfels=8000", "density.max_surfels=11000"),
+        "baseline",
+        2,
+    ),
     "paper": Variant("full, multi-view steps (MVGS)", "paper", (), "full", 2),
     "no-indirect": Variant("fast, reflections of the light alone", "fast", ("indirect=none",), "fast", 2),
     "no-depth": Variant("full, no depth prior", "deferred2dgs", (*CSCR, *RD, "weights.depth=0"), "full", 2),
     "no-normal": Variant("full, no L_normal", "deferred2dgs", (*CSCR, *RD, "weights.normal=0"), "full", 2),
-    "no-delta-normal": Variant("full, no Δn", "deferred2dgs",
-                               (*CSCR, *RD, "weights.delta_normal=0", "rates.delta_normal=[0,0]"), "full", 2),
+    "no-delta-normal": Variant(
+        "full, no Δn", "deferred2dgs", (*CSCR, *RD, "weights.delta_normal=0", "rates.delta_normal=[0,0]"), "full", 2
+    ),
 }
 
 #: The paper's ablation, means over Shiny Blender.
@@ -70,6 +84,7 @@ PAPER = {
 }
 
 # ---- What there is to do ----
+
 
 def known_variants() -> dict[str, Variant]:
     """`VARIANTS`, and every preset by its name."""
@@ -91,17 +106,28 @@ def plan(suite, xml, *, scenes=None, variants=None, minutes=None, overrides=(), 
         variant = known[name]
         wanted = name in variants if variants else variant.scenes is None or k < variant.scenes
         changes = (*variant.overrides, *overrides, *budget(minutes), f"seed={seed}")
-        jobs.append(Job(scene, found[scene], name, seed, variant.preset, changes,
-                        to_dict(template.settings(variant.preset, changes)),
-                        Path(out) / scene / (f"{name}-{seed}" if seed else name),
-                        asked=wanted and (not scenes or scene in scenes)))
+        jobs.append(
+            Job(
+                scene,
+                found[scene],
+                name,
+                seed,
+                variant.preset,
+                changes,
+                to_dict(template.settings(variant.preset, changes)),
+                Path(out) / scene / (f"{name}-{seed}" if seed else name),
+                asked=wanted and (not scenes or scene in scenes),
+            )
+        )
     return jobs
 
 
 # ---- Doing it ----
 
-def ablate(suite, xml, *, scenes=None, variants=None, minutes=None, overrides=(), seeds=(0,), out="runs/ablation",
-           quiet=False) -> int:
+
+def ablate(
+    suite, xml, *, scenes=None, variants=None, minutes=None, overrides=(), seeds=(0,), out="runs/ablation", quiet=False
+) -> int:
     """Fit what is not yet fitted; write tables and pictures (see the module). Ctrl-C saves; the same call then goes on.
 
     Args:
@@ -132,6 +158,7 @@ def ablate(suite, xml, *, scenes=None, variants=None, minutes=None, overrides=()
 
 def _fit_scene(group, jobs, errors, xml, out, quiet):
     """The fits of one scene with one seed, and its picture."""
+
     def failed(job, error):
         errors[job.folder] = str(error)
         print(f"{job.folder}: {error}", file=sys.stderr)
@@ -156,8 +183,11 @@ def _fit_scene(group, jobs, errors, xml, out, quiet):
                     failed(job, error)
                 _write(jobs, errors, out)
     finally:
-        shown = [(known_variants()[job.variant].label, job.figures(), job.folder) for job in jobs
-                 if (job.scene, job.seed) == (scene, jobs[0].seed) and job.folder not in errors and job.figures()]
+        shown = [
+            (known_variants()[job.variant].label, job.figures(), job.folder)
+            for job in jobs
+            if (job.scene, job.seed) == (scene, jobs[0].seed) and job.folder not in errors and job.figures()
+        ]
         try:
             if shown:
                 picture(out / f"{scene}.png", views, shown, group[0].settings["background"])
@@ -166,6 +196,7 @@ def _fit_scene(group, jobs, errors, xml, out, quiet):
 
 
 # ---- What comes out ----
+
 
 def _write(jobs, errors, out):
     """Write the tables: the summary of them, and their paths."""
@@ -181,6 +212,8 @@ def _write(jobs, errors, out):
 
 def _introduction(jobs):
     seeds = list(dict.fromkeys(job.seed for job in jobs))
-    return (f"{effort(jobs[0].settings)}; seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}. Figures of held-out "
-            "views: means over views, seeds, scenes. Δ: the difference on the scenes and seeds that both have; in brackets "
-            "that of each seed. The paper's are of Shiny Blender.")
+    return (
+        f"{effort(jobs[0].settings)}; seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}. Figures of held-out "
+        "views: means over views, seeds, scenes. Δ: the difference on the scenes and seeds that both have; in brackets "
+        "that of each seed. The paper's are of Shiny Blender."
+    )

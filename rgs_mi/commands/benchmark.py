@@ -40,6 +40,7 @@ def _milliseconds(call, repeat=_REPEAT) -> float:
 
 # ---- Splatter ----
 
+
 def sphere(count: int, seed=0) -> Surfels:
     """Random surfels on the unit sphere, that cover it about four times."""
     rng = np.random.default_rng(seed)
@@ -49,9 +50,19 @@ def sphere(count: int, seed=0) -> Surfels:
     scales = 0.6 * np.sqrt(4 * np.pi / count) * np.exp(0.3 * rng.normal(size=(count, 2)))
     opacities = 1 / (1 + np.exp(-1.5 * rng.normal(size=(count, 1)) - 1))
     grey, zero = np.full((count, 3), 0.5), np.zeros((count, 3))
-    return Surfels.from_numpy({"centers": centers, "rotations": rotation_from_normal(normals), "scales": scales,
-                               "opacities": opacities, "sh": zero, "base_color": grey, "roughness": grey[:, :1],
-                               "metallic": zero[:, :1], "delta_normal": zero})
+    return Surfels.from_numpy(
+        {
+            "centers": centers,
+            "rotations": rotation_from_normal(normals),
+            "scales": scales,
+            "opacities": opacities,
+            "sh": zero,
+            "base_color": grey,
+            "roughness": grey[:, :1],
+            "metallic": zero[:, :1],
+            "delta_normal": zero,
+        }
+    )
 
 
 def splat_times(surfels: Surfels, size: int) -> dict[str, float]:
@@ -113,12 +124,22 @@ def splat(count=50_000, size=800, against=None, rounds=3):
 
 # ---- Step ----
 
+
 def step(path, data, count=15_000, steps=20, overrides=()):
     """Print the time of a fit's step on one view at full resolution with ``count`` surfels, and the kernels that were
     compiled after warm-up (which a fit of constant size should not need)."""
     scene = FitScene.load(path, data)
-    settings = scene.settings(None, [f"start.surfels={count}", "iterations=10000000", "density.start=1", "sh_start=0",
-                                     "stages=[{until: 1, downscale: 1, views: 1}]", *overrides])
+    settings = scene.settings(
+        None,
+        [
+            f"start.surfels={count}",
+            "iterations=10000000",
+            "density.start=1",
+            "sh_start=0",
+            "stages=[{until: 1, downscale: 1, views: 1}]",
+            *overrides,
+        ],
+    )
     fit: Fit = start(scene, scene.dataset(), settings)
     for _ in range(len(fit.dataset.train)):  # loads each photograph once
         fit.step()
@@ -128,5 +149,7 @@ def step(path, data, count=15_000, steps=20, overrides=()):
         kernels = dr.kernel_history((dr.KernelType.JIT,))
     compiled = sum(not k["cache_hit"] or k["cache_disk"] for k in kernels)
     width, height = fit.dataset.train[0].camera.size
-    print(f"{len(fit.model)} surfels, {width} x {height} pixels: {milliseconds:.1f} ms a step, "
-          f"{len(kernels) / (steps + 1):.0f} kernels a step, {compiled} compiled after warm-up")
+    print(
+        f"{len(fit.model)} surfels, {width} x {height} pixels: {milliseconds:.1f} ms a step, "
+        f"{len(kernels) / (steps + 1):.0f} kernels a step, {compiled} compiled after warm-up"
+    )

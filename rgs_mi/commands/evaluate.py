@@ -24,9 +24,21 @@ from ..settings.config import completed
 from ..settings.settings import Settings
 from ..shading.environment import Environment
 
-_FACTS = {"finished": bool, "train_seconds": (int, float), "iterations": int, "surfels": int, "parameters": int,
-          "peak_rss_mb": (int, float), "train_views": int, "test_views": int, "settings": dict, "versions": dict,
-          "machine": dict, "command": str, "views": dict}  # what metrics.json must say of the fit
+_FACTS = {
+    "finished": bool,
+    "train_seconds": (int, float),
+    "iterations": int,
+    "surfels": int,
+    "parameters": int,
+    "peak_rss_mb": (int, float),
+    "train_views": int,
+    "test_views": int,
+    "settings": dict,
+    "versions": dict,
+    "machine": dict,
+    "command": str,
+    "views": dict,
+}  # what metrics.json must say of the fit
 
 
 def reevaluate(run, data=None, quiet=False) -> dict:

@@ -75,12 +75,18 @@ def sampled(texels: np.ndarray, metallic: float, base_color: float, seed: int) -
     view = np.sqrt(1 - sine**2) * normal + sine * across
     vector = lambda v: mi.Vector3f(lanes(v[:, 0]), lanes(v[:, 1]), lanes(v[:, 2]))
     constant = lambda v: lanes(np.full(_LANES, v))
-    surfaces = (vector(normal), vector(view), lanes(rng.uniform(0, 1, _LANES)), constant(metallic),
-                mi.Color3f(*3 * (constant(base_color),)))
+    surfaces = (
+        vector(normal),
+        vector(view),
+        lanes(rng.uniform(0, 1, _LANES)),
+        constant(metallic),
+        mi.Color3f(*3 * (constant(base_color),)),
+    )
     environment = Environment(mi.TensorXf(texels), np.eye(3))
     with dr.suspend_grad():
-        estimator = MonteCarlo(environment.unfiltered(), environment.emitter(), DEFAULT_ETA, _SAMPLES,
-                               dr.opaque(mi.UInt32, seed))
+        estimator = MonteCarlo(
+            environment.unfiltered(), environment.emitter(), DEFAULT_ETA, _SAMPLES, dr.opaque(mi.UInt32, seed)
+        )
         truth = estimator.specular(*surfaces)
         dr.eval(truth)
     return Lanes(environment.filtered(), surfaces, truth)

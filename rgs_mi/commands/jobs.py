@@ -26,6 +26,7 @@ _DIGEST = "photographs.sha256"  # beside or above the fits: what they are of
 
 # ---- What there is to do ----
 
+
 @dataclass(frozen=True)
 class Job:
     """One fit to the photographs ``data`` of ``scene``, into ``folder``: ``overrides`` over ``config`` (a preset, a file or
@@ -63,8 +64,9 @@ def find_scenes(suite) -> dict[str, Path]:
     captures = {path.name: path for path in suite.glob("*") if is_capture(path)}
     found = {path.stem: path for path in suite.glob("*.xml")} | captures
     if not found:
-        raise UserError(f"{suite} holds neither scenes (*.xml) nor captures (folders with {looked_for()}): "
-                        "give a folder of some")
+        raise UserError(
+            f"{suite} holds neither scenes (*.xml) nor captures (folders with {looked_for()}): give a folder of some"
+        )
     return dict(sorted(found.items()))
 
 
@@ -86,6 +88,7 @@ def effort(settings: dict) -> str:
 
 
 # ---- Doing it ----
+
 
 def photographs(xml, data, quiet):
     """A scene's photographs, path-traced first where need be: a digest of all, and a few test views to show."""
@@ -121,6 +124,7 @@ def fit(xml, job, quiet):
 
 # ---- What comes out ----
 
+
 def rows_of(jobs, errors) -> list[dict]:
     """A row (see `comparison`) for each fit that is there or was asked for; ``errors``: {folder: what went wrong}."""
     rows = []
@@ -129,8 +133,11 @@ def rows_of(jobs, errors) -> list[dict]:
         figures = None if error else job.figures()
         if figures or job.asked:
             status = "failed" if error else "finished" if figures else "missing"
-            rows.append({"scene": job.scene, "variant": job.variant, "seed": job.seed, "status": status}
-                        | {name: figures and figures.get(name) for name in (*FIGURES, *DETAILS)} | {"error": error})
+            rows.append(
+                {"scene": job.scene, "variant": job.variant, "seed": job.seed, "status": status}
+                | {name: figures and figures.get(name) for name in (*FIGURES, *DETAILS)}
+                | {"error": error}
+            )
     return rows
 
 
@@ -142,8 +149,11 @@ def write_tables(out, name, sections, rows, told) -> list[Path]:
     writer.writeheader()
     writer.writerows(rows)
     paths = []
-    for suffix, text in {"md": "\n\n".join(sections) + "\n", "csv": lines.getvalue(),
-                         "json": json.dumps({"runs": rows} | told, indent=1) + "\n"}.items():
+    for suffix, text in {
+        "md": "\n\n".join(sections) + "\n",
+        "csv": lines.getvalue(),
+        "json": json.dumps({"runs": rows} | told, indent=1) + "\n",
+    }.items():
         paths.append(Path(out) / f"{name}.{suffix}")
         with atomic_file(paths[-1]) as stream:
             stream.write(text.encode())

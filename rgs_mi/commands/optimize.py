@@ -30,8 +30,20 @@ _ON_SURFACE, _ANYWHERE = 0.7, 0.1  # opacities to start with; where surfels fill
 _SMOOTHING = 0.95  # of the PSNR that the progress line shows
 
 
-def optimize(path, *, data=None, variables=None, config=None, overrides=(), minutes=None, seed=None, out=None,
-             resume=False, quiet=False, tensorboard=False) -> Path:
+def optimize(
+    path,
+    *,
+    data=None,
+    variables=None,
+    config=None,
+    overrides=(),
+    minutes=None,
+    seed=None,
+    out=None,
+    resume=False,
+    quiet=False,
+    tensorboard=False,
+) -> Path:
     """Fit the scene at ``path`` and write the run's folder, which is returned.
 
     Args:
@@ -44,8 +56,11 @@ def optimize(path, *, data=None, variables=None, config=None, overrides=(), minu
     Raises: UserError for bad input, a package that is missing, a folder that can't be written, and a fit that diverges.
     """
     scene = FitScene.load(path, data, variables)
-    overrides = [*overrides, *([f"minutes={minutes}", "iterations=null"] if minutes is not None else []),
-                 *([f"seed={seed}"] if seed is not None else [])]
+    overrides = [
+        *overrides,
+        *([f"minutes={minutes}", "iterations=null"] if minutes is not None else []),
+        *([f"seed={seed}"] if seed is not None else []),
+    ]
     settings = scene.settings(config, overrides)
     folder = Path(out) if out else Path("runs") / scene.name
     saved = _saved(folder, resume)
@@ -61,6 +76,7 @@ def optimize(path, *, data=None, variables=None, config=None, overrides=(), minu
 
 
 # ---- Start ----
+
 
 def _saved(folder, resume):
     """The checkpoint to go on from, or None. Raises: UserError where a fresh start would lose an unfinished run."""
@@ -89,9 +105,18 @@ def start(scene, dataset, settings, quiet=True) -> Fit:
         extent = shading.box.radius
         points = _with_surroundings(points, dataset, settings)
     light = scene.environment
-    model = Model.start(*points, light.texels.numpy(), light.rotation, settings.sh_order, settings.seed,
-                        begin.scale, opacity, begin.roughness, settings.shader,
-                        two_sided=None if shading.box is None else True)
+    model = Model.start(
+        *points,
+        light.texels.numpy(),
+        light.rotation,
+        settings.sh_order,
+        settings.seed,
+        begin.scale,
+        opacity,
+        begin.roughness,
+        settings.shader,
+        two_sided=None if shading.box is None else True,
+    )
     return Fit(dataset, model, settings, extent, shading, _priors(dataset, settings))
 
 
@@ -137,8 +162,9 @@ def _resume(saved, scene, dataset, settings) -> Fit:
     if changed:
         listing = ", ".join(f"{key} {old.get(key)} -> {new[key]}" for key in changed)
         print(f"settings differ from the checkpoint's, the new ones hold: {listing}", file=sys.stderr)
-    return Fit.resume(dataset, settings, arrays, meta, shading=_shading(scene, dataset, settings),
-                      priors=_priors(dataset, settings))
+    return Fit.resume(
+        dataset, settings, arrays, meta, shading=_shading(scene, dataset, settings), priors=_priors(dataset, settings)
+    )
 
 
 def _photographs(dataset) -> list:
@@ -156,6 +182,7 @@ def _flat(tree, prefix="") -> dict:
 
 # ---- Loop ----
 
+
 def _loop(fit, folder, quiet, events=None) -> bool:
     """Step until the budget is spent or someone interrupts; returns whether someone did. Begins and ends with a
     checkpoint: a folder that can't be written is known before the work, not after it."""
@@ -171,8 +198,9 @@ def _loop(fit, folder, quiet, events=None) -> bool:
             if not np.isfinite(fit.psnr):
                 raise _diverged(fit, folder)
             psnr = fit.psnr if psnr is None else _SMOOTHING * psnr + (1 - _SMOOTHING) * fit.psnr
-            progress.update(fit.progress, psnr=psnr, surfels=len(fit.model), ms=1e3 * (fit.elapsed - before),
-                            pixels=fit.pixels)
+            progress.update(
+                fit.progress, psnr=psnr, surfels=len(fit.model), ms=1e3 * (fit.elapsed - before), pixels=fit.pixels
+            )
             if events and recorded:
                 events.add(fit.curves.rows[-1])
             if time.monotonic() - saved > settings.checkpoint_seconds:
@@ -195,5 +223,7 @@ def _state(fit, folder):
 
 
 def _diverged(fit, folder):
-    return UserError(f"the fit diverged at step {fit.step_number} (not a finite number): {folder / 'checkpoints'} has "
-                     "the last good state: go on with --resume and lower rates, e.g. --set rates.centers=[1e-4,1e-5]")
+    return UserError(
+        f"the fit diverged at step {fit.step_number} (not a finite number): {folder / 'checkpoints'} has "
+        "the last good state: go on with --resume and lower rates, e.g. --set rates.centers=[1e-4,1e-5]"
+    )

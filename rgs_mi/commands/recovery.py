@@ -98,8 +98,10 @@ def true_maps(view) -> dict[str, np.ndarray]:
     channels = {field.name: np.array(bitmap)[..., k] for k, field in enumerate(bitmap.struct_())}
     names = dict.fromkeys(name.split(".")[0] for name in channels)
     order = lambda name: [c for c in ("R", "G", "B", "X", "Y", "Z") if f"{name}.{c}" in channels]
-    return {name: np.stack([channels[f"{name}.{c}"] for c in order(name)], -1) if order(name) else channels[name][..., None]
-            for name in names}
+    return {
+        name: np.stack([channels[f"{name}.{c}"] for c in order(name)], -1) if order(name) else channels[name][..., None]
+        for name in names
+    }
 
 
 def _materials(scene, path, views):
@@ -117,7 +119,9 @@ def _materials(scene, path, views):
     ours, true = (np.concatenate(p) for p in zip(*pairs))
     factor = (ours * true).sum(0) / np.maximum((ours * ours).sum(0), 1e-9)
     return {f"{name}_mae": float(np.mean(e)) for name, e in errors.items()} | {
-        "base_color_mae": float(abs(ours * factor - true).mean()), "base_color_factor": factor.tolist()}
+        "base_color_mae": float(abs(ours * factor - true).mean()),
+        "base_color_factor": factor.tolist(),
+    }
 
 
 def _environment(scene, true_scene, views):

@@ -19,8 +19,10 @@ from ..settings.config import to_dict
 from .jobs import Job, budget, check_names, check_photographs, effort, find_scenes, fit, photographs, rows_of, write_tables
 
 NAME = "suite"
-_REMARK = ("Figures of held-out views, means over views, then scenes. Data sets are told by the names of scenes: those in "
-           "scenes/targets have the names of Shiny Blender's, and are not them. The paper's times are of an RTX 3090 Ti.")
+_REMARK = (
+    "Figures of held-out views, means over views, then scenes. Data sets are told by the names of scenes: those in "
+    "scenes/targets have the names of Shiny Blender's, and are not them. The paper's times are of an RTX 3090 Ti."
+)
 
 
 def plan(root, xml, *, scenes=None, config=None, minutes=None, overrides=(), out) -> list[Job]:
@@ -32,12 +34,25 @@ def plan(root, xml, *, scenes=None, config=None, minutes=None, overrides=(), out
     check_names("scene", scenes, found)
     overrides = (*overrides, *budget(minutes))
     settings = to_dict(FitScene.load(xml, next(iter(found.values()))).settings(config, overrides))
-    return [Job(scene, data, Path(config).stem if config else "default", settings["seed"], config, overrides, settings,
-                Path(out) / scene, asked=not scenes or scene in scenes) for scene, data in found.items()]
+    return [
+        Job(
+            scene,
+            data,
+            Path(config).stem if config else "default",
+            settings["seed"],
+            config,
+            overrides,
+            settings,
+            Path(out) / scene,
+            asked=not scenes or scene in scenes,
+        )
+        for scene, data in found.items()
+    ]
 
 
-def fit_suite(root, xml, *, scenes=None, config=None, minutes=None, overrides=(), workers=1, out="runs/suite",
-              quiet=False) -> int:
+def fit_suite(
+    root, xml, *, scenes=None, config=None, minutes=None, overrides=(), workers=1, out="runs/suite", quiet=False
+) -> int:
     """Fit the scenes that are not yet fitted; write the tables and the page (see the module). Ctrl-C saves; the same call
     then goes on.
 
@@ -72,8 +87,15 @@ def fit_suite(root, xml, *, scenes=None, config=None, minutes=None, overrides=()
     finally:
         text, paths = _write(jobs, errors, out)
         page = out / f"{NAME}.html"
-        write_suite(page, [(job.scene, job.folder if job.figures() else None, errors.get(job.folder)) for job in jobs
-                           if job.asked or job.figures()], f"Suite {Path(root).resolve().name}")
+        write_suite(
+            page,
+            [
+                (job.scene, job.folder if job.figures() else None, errors.get(job.folder))
+                for job in jobs
+                if job.asked or job.figures()
+            ],
+            f"Suite {Path(root).resolve().name}",
+        )
     print("\n".join([text, "", *map(str, (*paths, page))]))
     return len(errors)
 

@@ -15,8 +15,8 @@ def lanes(values: np.ndarray):
     values = np.asarray(values, np.float32).ravel()
     memory = np.empty(values.size + _ALIGNMENT // 4, np.float32)
     first = -memory.ctypes.data % _ALIGNMENT // 4
-    memory[first:first + values.size] = values
-    return mi.Float(memory[first:first + values.size])
+    memory[first : first + values.size] = values
+    return mi.Float(memory[first : first + values.size])
 
 
 def tensor(values: np.ndarray):

@@ -59,8 +59,12 @@ class Camera:
     def resized(self, width: int, height: int) -> "Camera":
         """The same camera with another pixel grid over the same image plane."""
         sx, sy = width / self.size[0], height / self.size[1]
-        return replace(self, focal=(self.focal[0] * sx, self.focal[1] * sy),
-                       principal=(self.principal[0] * sx, self.principal[1] * sy), size=(width, height))
+        return replace(
+            self,
+            focal=(self.focal[0] * sx, self.focal[1] * sy),
+            principal=(self.principal[0] * sx, self.principal[1] * sy),
+            size=(width, height),
+        )
 
     def subdivided(self, spp: int) -> tuple["Camera", int]:
         """The same camera with a pixel for each of ``spp`` samples of a pixel, rounded up to a square, and how many of them
@@ -100,8 +104,10 @@ class Camera:
         scalar = lambda key: float(np.array(params[key]).ravel()[0])
         focal = 0.5 * width / np.tan(np.radians(scalar("x_fov")) / 2)
         # A positive principal point offset shifts the optical centre by that fraction of the film, see the plugin's docs.
-        principal = (width * (0.5 - scalar("principal_point_offset_x")) - offset[0],
-                     height * (0.5 - scalar("principal_point_offset_y")) - offset[1])
+        principal = (
+            width * (0.5 - scalar("principal_point_offset_x")) - offset[0],
+            height * (0.5 - scalar("principal_point_offset_y")) - offset[1],
+        )
         to_world = np.array(params["to_world"].matrix, np.float64).reshape(4, 4) @ _MITSUBA_TO_CV
         return cls(to_world, (focal, focal), principal, (int(crop[0]), int(crop[1])))
 

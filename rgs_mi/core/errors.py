@@ -10,6 +10,7 @@ class UserError(Exception):
 
 def listed(kind=str):
     """The type of an option that is a list: 'a,b' to [kind('a'), kind('b')]."""
+
     def parse(text):
         return [kind(entry.strip()) for entry in text.split(",") if entry.strip()]
 

@@ -52,8 +52,10 @@ def _explained(path):
     except OSError as error:
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         remedy = "free some space" if full else "check the folder's permissions and free space"
-        raise UserError(f"{path}: can't be written ({error.strerror or error}): {remedy} or choose another folder, "
-                        "what was there before is untouched") from error
+        raise UserError(
+            f"{path}: can't be written ({error.strerror or error}): {remedy} or choose another folder, "
+            "what was there before is untouched"
+        ) from error
 
 
 def write_png(path, image: np.ndarray):

@@ -1,6 +1,6 @@
 """The one line that tells how a fit or a rendering is getting on.
 
-    fitting ━━━━━━━━━━━━━━━━━━━━ 42% · PSNR 29.81 · 15 230 surfels · 96 ms/step · 200 px · 3:12 left
+fitting ━━━━━━━━━━━━━━━━━━━━ 42% · PSNR 29.81 · 15 230 surfels · 96 ms/step · 200 px · 3:12 left
 """
 
 import sys
@@ -62,8 +62,15 @@ class Progress:
 
     def __rich__(self):
         done = round(_BAR * self.fraction)
-        return Text.assemble(f"{self.label} ", ("━" * done, "green"), ("━" * (_BAR - done), "bright_black"), " ",
-                             self._text(), no_wrap=True, overflow="ellipsis")
+        return Text.assemble(
+            f"{self.label} ",
+            ("━" * done, "green"),
+            ("━" * (_BAR - done), "bright_black"),
+            " ",
+            self._text(),
+            no_wrap=True,
+            overflow="ellipsis",
+        )
 
     def _print(self):
         self._printed = time.monotonic()
@@ -71,8 +78,10 @@ class Progress:
             print(self.label, self._text(), file=sys.stderr, flush=True)
 
     def _text(self):
-        words = [_WORDS[name](value) if name in _WORDS else f"{name.replace('_', ' ')} {_plain(value)}"
-                 for name, value in self.fields.items()]
+        words = [
+            _WORDS[name](value) if name in _WORDS else f"{name.replace('_', ' ')} {_plain(value)}"
+            for name, value in self.fields.items()
+        ]
         return " · ".join([f"{100 * self.fraction:.0f}%", *words, *self._time()])
 
     def _time(self):

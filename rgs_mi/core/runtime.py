@@ -16,8 +16,10 @@ from .errors import UserError
 MIN_LLVM = 16
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 _VARIABLE = "DRJIT_LIBLLVM_PATH"
-_REMEDY = (f"install one (Debian: `apt install libllvm19`, macOS: `brew install llvm`, Linux x86-64: "
-           f"`pip install karellen-llvm-core`) or set {_VARIABLE} to its file")
+_REMEDY = (
+    f"install one (Debian: `apt install libllvm19`, macOS: `brew install llvm`, Linux x86-64: "
+    f"`pip install karellen-llvm-core`) or set {_VARIABLE} to its file"
+)
 
 
 def llvm_version(path) -> int | None:
@@ -39,7 +41,7 @@ def _candidates():
     for root in ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt/llvm/lib", "/usr/local/opt/llvm/lib"):
         for pattern in ("libLLVM*.so*", "*/libLLVM*.so*", "llvm-*/lib/libLLVM*.so*", "libLLVM*.dylib"):
             found += Path(root).glob(pattern)
-    yield from sorted(found, key=lambda p: (llvm_version(p) or 0), reverse=True)
+    yield from sorted(found, key=lambda p: llvm_version(p) or 0, reverse=True)
     if name := ctypes.util.find_library("LLVM"):
         yield name
 
@@ -86,5 +88,7 @@ def set_variant(name: str = "llvm_ad_rgb"):
     if dr.thread_count() < 2:
         dr.set_thread_count(2)  # on one core Mitsuba waits forever for an EXR file that it reads or writes (mitsuba3#21)
     if name.startswith("llvm") and dr.detail.llvm_version()[0] < MIN_LLVM:
-        raise UserError(f"Dr.Jit had loaded LLVM {dr.detail.llvm_version()[0]} before rgs_mi could choose one: "
-                        "import rgs_mi before drjit and mitsuba")
+        raise UserError(
+            f"Dr.Jit had loaded LLVM {dr.detail.llvm_version()[0]} before rgs_mi could choose one: "
+            "import rgs_mi before drjit and mitsuba"
+        )

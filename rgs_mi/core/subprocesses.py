@@ -21,7 +21,7 @@ def apart(function, *arguments):
     Raises: UserError, in one line, for whatever goes wrong there, a crash or kill included; KeyboardInterrupt after Ctrl-C,
     when the process has ended. Pressing again kills it.
     """
-    (_, value, error), = each_apart(function, [arguments])
+    ((_, value, error),) = each_apart(function, [arguments])
     if error:
         raise error
     return value
@@ -93,6 +93,7 @@ class _Call:
 
 def _work(send, variant, threads, function, arguments):
     """What the process does: send (value, None), or (None, what went wrong)."""
+
     def main():
         try:
             set_variant(variant)

@@ -55,11 +55,19 @@ def _bytes(text="", *_):
     return text.encode("latin1")
 
 
-_ADMITTED = {("numpy", "ndarray"): _array, ("numpy", "dtype"): _dtype, ("_codecs", "encode"): _bytes,
-             ("__builtin__", "bytes"): _bytes, ("collections", "OrderedDict"): OrderedDict}
+_ADMITTED = {
+    ("numpy", "ndarray"): _array,
+    ("numpy", "dtype"): _dtype,
+    ("_codecs", "encode"): _bytes,
+    ("__builtin__", "bytes"): _bytes,
+    ("collections", "OrderedDict"): OrderedDict,
+}
 for _core in ("numpy.core", "numpy._core"):  # before NumPy 2, and since
-    _ADMITTED |= {(f"{_core}.multiarray", "_reconstruct"): _array, (f"{_core}.multiarray", "scalar"): _scalar,
-                  (f"{_core}.numeric", "_frombuffer"): _from_buffer}
+    _ADMITTED |= {
+        (f"{_core}.multiarray", "_reconstruct"): _array,
+        (f"{_core}.multiarray", "scalar"): _scalar,
+        (f"{_core}.numeric", "_frombuffer"): _from_buffer,
+    }
 
 
 class _Unpickler(pickle._Unpickler):  # the one in Python: a damaged number makes that in C fill the memory

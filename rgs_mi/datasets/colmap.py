@@ -44,17 +44,29 @@ def load(root: Path) -> Dataset:
     paths = _paths([image.name for image in images], root / "images", folder)
     frames = [_frame(image, source, paths[image.name] or folder / image.name, root / "masks") for image in images]
     if (bare := [frame for frame in frames if not frame.mask]) and (root / "masks").is_dir():
-        warnings.warn(f"{root / 'masks'}: {len(bare)} of {len(frames)} photographs have no mask (first: {bare[0].name})",
-                      stacklevel=3)
+        warnings.warn(
+            f"{root / 'masks'}: {len(bare)} of {len(frames)} photographs have no mask (first: {bare[0].name})", stacklevel=3
+        )
     points, colors = sparse_points(root, [f"{model}/points3D{e}" for e in (".bin", ".txt", ".ply")]) or (None, None)
-    return Dataset(**load_split(source, frames, every_eighth(sorted(frame.name for frame in frames))), points=points,
-                   point_colors=colors, root=root)
+    return Dataset(
+        **load_split(source, frames, every_eighth(sorted(frame.name for frame in frames))),
+        points=points,
+        point_colors=colors,
+        root=root,
+    )
 
 
 def _model(root: Path) -> tuple[str, str] | None:
     """The folder and the suffix of the model's files, None where there is none."""
-    return next(((model, suffix) for model in FOLDERS for suffix in (".bin", ".txt")
-                 if all(os.path.isfile(root / model / (name + suffix)) for name in ("cameras", "images"))), None)
+    return next(
+        (
+            (model, suffix)
+            for model in FOLDERS
+            for suffix in (".bin", ".txt")
+            if all(os.path.isfile(root / model / (name + suffix)) for name in ("cameras", "images"))
+        ),
+        None,
+    )
 
 
 def _paths(names: list[str], originals: Path, copies: Path) -> dict[str, Path | None]:
@@ -74,6 +86,12 @@ def _frame(image: Image, source: Path, path: Path, masks: Path) -> Frame:
     to_world = np.linalg.inv(rigid(image.to_camera, where, _REMEDY))
     stem = image_stem(Path(image.name))
     mask = next((m for m in (masks / f"{stem}.png", masks / f"{image.name}.png") if os.path.isfile(m)), None)
-    return Frame(where, "_".join(part for part in stem.parts if part.strip("./")), path,
-                 lambda size: pinhole(to_world, lens.focal, lens.principal, lens.size, size, where), lens.distortion,
-                 mask=partial(read_grey, mask, where) if mask else None, missing=not os.path.isfile(path))
+    return Frame(
+        where,
+        "_".join(part for part in stem.parts if part.strip("./")),
+        path,
+        lambda size: pinhole(to_world, lens.focal, lens.principal, lens.size, size, where),
+        lens.distortion,
+        mask=partial(read_grey, mask, where) if mask else None,
+        missing=not os.path.isfile(path),
+    )

@@ -21,9 +21,19 @@ from .distortion import Distortion
 # in the order of their numbers; how many parameters each has, None where the lens is not a perspective one with Brown's
 # distortion
 CAMERA_MODELS = {
-    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": None,
-    "FULL_OPENCV": 12, "FOV": None, "SIMPLE_RADIAL_FISHEYE": None, "RADIAL_FISHEYE": None, "THIN_PRISM_FISHEYE": None,
-    "RAD_TAN_THIN_PRISM_FISHEYE": None}
+    "SIMPLE_PINHOLE": 3,
+    "PINHOLE": 4,
+    "SIMPLE_RADIAL": 4,
+    "RADIAL": 5,
+    "OPENCV": 8,
+    "OPENCV_FISHEYE": None,
+    "FULL_OPENCV": 12,
+    "FOV": None,
+    "SIMPLE_RADIAL_FISHEYE": None,
+    "RADIAL_FISHEYE": None,
+    "THIN_PRISM_FISHEYE": None,
+    "RAD_TAN_THIN_PRISM_FISHEYE": None,
+}
 _KEYPOINT = 24  # bytes
 _MOST_EXTREME = 1e8  # of a camera's numbers; what lies beyond is damage
 
@@ -56,8 +66,10 @@ def read_model(folder: Path, suffix: str) -> list[Image]:
     lenses, images = map(_read, (folder / f"cameras{suffix}", folder / f"images{suffix}"), readers)
     for name, camera, _ in images:
         if camera not in lenses:
-            raise UserError(f"{folder / f'images{suffix}'}: image {name!r} has camera {camera}, which cameras{suffix} "
-                            "lacks: export the model again")
+            raise UserError(
+                f"{folder / f'images{suffix}'}: image {name!r} has camera {camera}, which cameras{suffix} "
+                "lacks: export the model again"
+            )
     return [Image(name, lenses[camera], pose) for name, camera, pose in images]
 
 
@@ -82,6 +94,7 @@ class _UnknownModel(Exception):
 
 # ---- Records; a ValueError's message is the reason alone ----
 
+
 def _lens(model: str, size, parameters) -> Lens:
     """The camera with a COLMAP model's parameters: focal length(s), principal point, distortion."""
     if CAMERA_MODELS.get(model) is None:
@@ -104,8 +117,10 @@ def _pose(q, t) -> np.ndarray:
     """[4, 4] world to camera."""
     length = np.linalg.norm(q)
     if not 1e-3 < length < 1e3 or not np.isfinite(t).all():  # False for NaN
-        raise ValueError(f"an image's pose is no rotation and translation: q = {' '.join(f'{x:g}' for x in q)}, "
-                         f"t = {' '.join(f'{x:g}' for x in t)}")
+        raise ValueError(
+            f"an image's pose is no rotation and translation: q = {' '.join(f'{x:g}' for x in q)}, "
+            f"t = {' '.join(f'{x:g}' for x in t)}"
+        )
     pose = np.eye(4)
     pose[:3, :3] = Rotation.from_quat([*q[1:], q[0]]).as_matrix()
     pose[:3, 3] = t
@@ -123,6 +138,7 @@ def _once(records, what: str) -> dict:
 
 
 # ---- Text ----
+
 
 def _lines(path):
     with open(path, encoding="utf-8") as stream:
@@ -156,6 +172,7 @@ def _images_text(path):
 
 
 # ---- Binary ----
+
 
 def _binary(path, record):
     """The records of a file, each read by ``record(content, at)``, which returns it and where it ends."""
@@ -192,7 +209,7 @@ def _images_binary(path):
         end = content.find(b"\0", start)
         if end < 0:
             raise ValueError("an image's name has no end")
-        keypoints, = struct.unpack_from("<Q", content, end + 1)
+        (keypoints,) = struct.unpack_from("<Q", content, end + 1)
         return (content[start:end].decode("utf-8"), camera, _pose(pose[:4], pose[4:])), end + 9 + _KEYPOINT * keypoints
 
     return _binary(path, record)

@@ -44,8 +44,7 @@ class Distortion:
         p1, p2 = self.tangential
         r2 = x**2 + y**2
         factor = np.where(r2 < self._reach(np.sqrt(r2.max())) ** 2, self._factor(r2), np.nan)
-        return (x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x**2),
-                y * factor + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y)
+        return (x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x**2), y * factor + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y)
 
     def _factor(self, r2):
         top, bottom = (np.polyval((*reversed(k), 1.0), r2) for k in (self.radial, self.denominator))
@@ -64,8 +63,9 @@ def undistorted(pixels: np.ndarray, camera: Camera, distortion: Distortion, name
     Bilinear, in linear light, weighted with alpha. Where the photograph shows nothing alpha is 0. The result is kept in
     `CACHE` and found again by the pixels, the camera, the coefficients and the view's ``name``.
     """
-    digest = hashlib.sha256(repr((_VERSION, name, pixels.dtype, pixels.shape, camera.focal, camera.principal,
-                                  distortion)).encode())
+    digest = hashlib.sha256(
+        repr((_VERSION, name, pixels.dtype, pixels.shape, camera.focal, camera.principal, distortion)).encode()
+    )
     digest.update(np.ascontiguousarray(pixels))
     path = CACHE / f"{digest.hexdigest()[:24]}.npz"
     result = _load(path, pixels)
@@ -107,8 +107,10 @@ def _load(path, pixels):
 
 def _resample(pixels, camera, distortion):
     height, width = pixels.shape[:2]
-    x, y = np.meshgrid((np.arange(width) + 0.5 - camera.principal[0]) / camera.focal[0],
-                       (np.arange(height) + 0.5 - camera.principal[1]) / camera.focal[1])
+    x, y = np.meshgrid(
+        (np.arange(width) + 0.5 - camera.principal[0]) / camera.focal[0],
+        (np.arange(height) + 0.5 - camera.principal[1]) / camera.focal[1],
+    )
     with np.errstate(over="ignore", invalid="ignore"):
         x, y = distortion.apply(x, y)
         column, row = x * camera.focal[0] + camera.principal[0], y * camera.focal[1] + camera.principal[1]

@@ -53,15 +53,21 @@ def load_views(source: Path, frames: list[Frame]) -> list[View]:
     missing, names = [frame for frame in frames if frame.missing], {}
     found = [frame for frame in frames if not frame.missing]
     if not found:
-        raise UserError(f"{source}: none of its {len(frames)} frames has an image file (first: {str(missing[0].path)!r}): "
-                        f"check the names and that the images were unpacked")
+        raise UserError(
+            f"{source}: none of its {len(frames)} frames has an image file (first: {str(missing[0].path)!r}): "
+            f"check the names and that the images were unpacked"
+        )
     for frame in found:
         if (first := names.setdefault(frame.name, frame)) is not frame:
-            raise UserError(f"{frame.where} has the same file name as {first.where} ({frame.path.name}): "
-                            "names must be unique")
+            raise UserError(
+                f"{frame.where} has the same file name as {first.where} ({frame.path.name}): names must be unique"
+            )
     if missing:
-        warnings.warn(f"{source}: {len(missing)} of {len(frames)} frames have no image file and are skipped "
-                      f"(first: {str(missing[0].path)!r})", stacklevel=4)
+        warnings.warn(
+            f"{source}: {len(missing)} of {len(frames)} frames have no image file and are skipped "
+            f"(first: {str(missing[0].path)!r})",
+            stacklevel=4,
+        )
     with ThreadPoolExecutor() as pool:
         views = list(pool.map(_load_view, found))
     kept = [view for view in views if view.pixels[..., 3].any()]
@@ -69,8 +75,9 @@ def load_views(source: Path, frames: list[Frame]) -> list[View]:
         raise UserError(f"{source}: the alpha channel of every image is zero: export with a mask, or as RGB")
     if len(kept) < len(views):
         first = next(view.path for view in views if not view.pixels[..., 3].any())
-        warnings.warn(f"{source}: {len(views) - len(kept)} views with an empty mask are left out (first: {first})",
-                      stacklevel=4)
+        warnings.warn(
+            f"{source}: {len(views) - len(kept)} views with an empty mask are left out (first: {first})", stacklevel=4
+        )
     return kept
 
 
@@ -99,9 +106,13 @@ def rigid(matrix: np.ndarray, where: str, remedy: str) -> np.ndarray:
     if not np.isfinite(matrix).all():
         raise UserError(f"{where}: the matrix holds NaN or infinity: {remedy}")
     rotation = matrix[:3, :3]
-    if (np.abs(rotation).max() > 2 or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3
-            or np.linalg.det(rotation) < 0 or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6
-            or np.abs(matrix[:3, 3]).max() > FARTHEST):
+    if (
+        np.abs(rotation).max() > 2
+        or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3
+        or np.linalg.det(rotation) < 0
+        or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6
+        or np.abs(matrix[:3, 3]).max() > FARTHEST
+    ):
         raise UserError(f"{where}: the matrix scales, shears, mirrors or lies absurdly far away: {remedy}")
     u, _, v = np.linalg.svd(rotation)  # the nearest rotation
     matrix = matrix.copy()
@@ -114,11 +125,16 @@ def pinhole(to_world, focal, principal, size, photograph: tuple[int, int], where
 
     Raises: UserError for numbers out of range and other proportions.
     """
-    for what, numbers, (lower, upper) in (("focal length", focal, FOCAL_LIMITS), ("image size", size, SIZE_LIMITS),
-                                          ("principal point", principal, (-SIZE_LIMITS[1], SIZE_LIMITS[1]))):
+    for what, numbers, (lower, upper) in (
+        ("focal length", focal, FOCAL_LIMITS),
+        ("image size", size, SIZE_LIMITS),
+        ("principal point", principal, (-SIZE_LIMITS[1], SIZE_LIMITS[1])),
+    ):
         if not all(lower < number < upper for number in numbers):  # False for NaN
-            raise UserError(f"{where}: the {what} {' x '.join(f'{n:g}' for n in numbers)} is out of range: "
-                            f"give pixels between {lower:g} and {upper:g}")
+            raise UserError(
+                f"{where}: the {what} {' x '.join(f'{n:g}' for n in numbers)} is out of range: "
+                f"give pixels between {lower:g} and {upper:g}"
+            )
     check_proportions(size, photograph, f"{where}: its camera")
     return Camera(to_world, tuple(map(float, focal)), tuple(map(float, principal)), tuple(size)).resized(*photograph)
 

@@ -50,8 +50,10 @@ def with_mask(pixels: np.ndarray, coverage: np.ndarray, where: str) -> tuple[np.
 def check_proportions(size: tuple[float, float], photograph: tuple[int, int], what: str):
     """Raises: UserError where ``what``, of ``size`` (width, height), cannot be a ``photograph`` of another resolution."""
     if abs(size[0] * photograph[1] / (size[1] * photograph[0]) - 1) > _ASPECT:
-        raise UserError(f"{what} is {size[0]:g} x {size[1]:g}, the photograph {photograph[0]} x {photograph[1]}: both must "
-                        "have the same proportions, neither cropped nor turned")
+        raise UserError(
+            f"{what} is {size[0]:g} x {size[1]:g}, the photograph {photograph[0]} x {photograph[1]}: both must "
+            "have the same proportions, neither cropped nor turned"
+        )
 
 
 def _decoded(read, path, where):
@@ -141,8 +143,10 @@ def read_normal(path: Path, pixels: np.ndarray, where: str) -> np.ndarray:
     clamped = path.stem.endswith("_0001")
     image = read_image(path, where)[0]
     if image.shape != pixels.shape:
-        raise UserError(f"{where}: {path} is {image.shape[1]} x {image.shape[0]}, its photograph "
-                        f"{pixels.shape[1]} x {pixels.shape[0]}: normals need the same size")
+        raise UserError(
+            f"{where}: {path} is {image.shape[1]} x {image.shape[0]}, its photograph "
+            f"{pixels.shape[1]} x {pixels.shape[0]}: normals need the same size"
+        )
     black = ~image[..., :3].any(-1, keepdims=True)
     normal = image[..., :3].astype(np.float32) / np.float32(255)
     normal = srgb_decode(normal) if clamped else 2 * normal - 1
@@ -161,8 +165,7 @@ def resize(values: np.ndarray, height: int, width: int) -> np.ndarray:
         return values.astype(np.float32)
     known = np.isfinite(values)
     # Pixel centres are at half integers on both grids.
-    rows, columns = (np.clip((np.arange(n) + 0.5) * (m / n) - 0.5, 0, m - 1)
-                     for n, m in zip((height, width), values.shape))
+    rows, columns = (np.clip((np.arange(n) + 0.5) * (m / n) - 0.5, 0, m - 1) for n, m in zip((height, width), values.shape))
     grid = np.meshgrid(rows, columns, indexing="ij")
     sample = lambda x: ndimage.map_coordinates(x.astype(np.float32), grid, order=1, mode="nearest")
     weight, total = sample(known), sample(np.where(known, values, 0))

@@ -59,7 +59,7 @@ def _frame(file: Path, meta: dict, index: int) -> Frame:
     if mask is None:
         return frame
     if not isinstance(mask, str):
-        raise UserError(f"{where}: \"mask_path\" is not a file name")
+        raise UserError(f'{where}: "mask_path" is not a file name')
     return replace(frame, mask=partial(read_grey, file.parent / mask, where))
 
 
@@ -71,7 +71,7 @@ def _split(file: Path, meta: dict, frames: list[Frame]) -> tuple[list[Frame], se
         if names is None:
             continue
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise UserError(f"{file}: \"{split}_filenames\" is not a list of file names")
+            raise UserError(f'{file}: "{split}_filenames" is not a list of file names')
         listed[split] = {os.path.normpath(name) for name in names}
     if not listed:
         return frames, every_eighth(sorted(frame.name for frame in frames))
@@ -80,8 +80,10 @@ def _split(file: Path, meta: dict, frames: list[Frame]) -> tuple[list[Frame], se
         raise UserError(f"{file}: {min(unknown)!r} in the lists of file names is no frame's file_path: export it again")
     test = listed.get("test") or listed.get("val") or set()
     train = listed.get("train") or entries.keys() - set().union(*listed.values())
-    return ([frame for name, frame in entries.items() if name in train or name in test],
-            {entries[name].name for name in test})
+    return (
+        [frame for name, frame in entries.items() if name in train or name in test],
+        {entries[name].name for name in test},
+    )
 
 
 def _points(file: Path, meta: dict):
@@ -89,13 +91,13 @@ def _points(file: Path, meta: dict):
     root, named = file.parent, meta.get("ply_file_path")
     if named is not None:
         if not isinstance(named, str):
-            raise UserError(f"{file}: \"ply_file_path\" is not a file name")
+            raise UserError(f'{file}: "ply_file_path" is not a file name')
         if not os.path.isfile(root / named):
             warnings.warn(f"{file}: its ply_file_path {named!r} is not there: the sparse points are not used", stacklevel=4)
         return sparse_points(root, [named])
     if (cloud := sparse_points(root, COLMAP_POINTS)) is None:
         return sparse_points(root, FILES)
-    where, remedy = f"{file}: \"applied_transform\"", "it must hold 3 rows of 4 numbers: export it again"
+    where, remedy = f'{file}: "applied_transform"', "it must hold 3 rows of 4 numbers: export it again"
     transform = matrix(meta.get("applied_transform", _EXCHANGE), where, remedy)[:3]
     if transform.shape != (3, 4) or not (np.abs(transform) <= FARTHEST).all():  # False for NaN
         raise UserError(f"{where}: {remedy}")

@@ -41,8 +41,12 @@ def load(root: Path) -> Dataset:
     files = sorted(root.glob(f"?*{CAMERA}"), key=lambda file: (len(file.name), file.name))  # 2 before 10
     frames = [_frame(file) for file in files]
     points, colors = sparse_points(root) or (None, None)
-    return Dataset(**load_split(root, frames, _held_out(root, [frame.name for frame in frames])), points=points,
-                   point_colors=colors, root=root)
+    return Dataset(
+        **load_split(root, frames, _held_out(root, [frame.name for frame in frames])),
+        points=points,
+        point_colors=colors,
+        root=root,
+    )
 
 
 def _frame(file: Path) -> Frame:
@@ -56,9 +60,14 @@ def _frame(file: Path) -> Frame:
     except (TypeError, ValueError) as error:
         raise UserError(f"{where} holds no camera: {_REMEDY}") from error
     to_world = np.linalg.inv(rigid(moved, where, _REMEDY))
-    return Frame(where, name, image or file.with_name(f"{name}.png"),
-                 lambda size: pinhole(to_world, (fx, fy), (cx, cy), size, size, where),
-                 mask=partial(_mask, depth, where) if os.path.isfile(depth) else None, missing=image is None)
+    return Frame(
+        where,
+        name,
+        image or file.with_name(f"{name}.png"),
+        lambda size: pinhole(to_world, (fx, fy), (cx, cy), size, size, where),
+        mask=partial(_mask, depth, where) if os.path.isfile(depth) else None,
+        missing=image is None,
+    )
 
 
 def _mask(depth: Path, where: str) -> np.ndarray:

@@ -29,17 +29,28 @@ from ..core.errors import UserError
 from ..core.progress import Progress
 from ..core.scene_files import load_scene
 
-FOV = 39.6                  # degrees, Blender's default camera (0.691 rad)
-MARGIN = 1.02               # keeps the object's bounding sphere off the frame
-TEST_SPP = 4                # times the samples of a training view: noise in a test view counts against every score
-AOV_GRID = 4                # samples per pixel and axis of the geometry pass
-AOV_CHANNELS = ("Depth.Z", "Normal.X", "Normal.Y", "Normal.Z", "Albedo.R", "Albedo.G", "Albedo.B",
-                "Roughness", "Metallic", "Alpha")
+FOV = 39.6  # degrees, Blender's default camera (0.691 rad)
+MARGIN = 1.02  # keeps the object's bounding sphere off the frame
+TEST_SPP = 4  # times the samples of a training view: noise in a test view counts against every score
+AOV_GRID = 4  # samples per pixel and axis of the geometry pass
+AOV_CHANNELS = (
+    "Depth.Z",
+    "Normal.X",
+    "Normal.Y",
+    "Normal.Z",
+    "Albedo.R",
+    "Albedo.G",
+    "Albedo.B",
+    "Roughness",
+    "Metallic",
+    "Alpha",
+)
 _GOLDEN = math.pi * (3 - math.sqrt(5))
 _CV_TO_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 # ---- Viewpoints ----
+
 
 def train_directions(count: int, seed: int = 0) -> np.ndarray:
     """[count, 3] unit directions from the object to the cameras: a Fibonacci lattice from -12 degrees to the zenith."""
@@ -54,7 +65,7 @@ def test_directions(count: int, seed: int = 0) -> np.ndarray:
     return _direction(6 * math.pi * t + 0.7 + seed, np.sin(np.radians(-6 + 71 * t)))
 
 
-test_directions.__test__ = False        # a name that pytest would collect
+test_directions.__test__ = False  # a name that pytest would collect
 
 
 def _direction(azimuth, z):
@@ -89,6 +100,7 @@ def _farthest(shape, point: np.ndarray) -> float:
 
 
 # ---- One view ----
+
 
 class Renderer:
     """A loaded scene and one camera that moves: kernels are compiled for the first view only."""
@@ -130,10 +142,11 @@ class Renderer:
         normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n)
         depth = si.t * dr.dot(to_world @ mi.Vector3f(0, 0, 1), ray.d)
         albedo = bsdf.eval_diffuse_reflectance(si, hit)
-        scalars = [dr.select(bsdf.has_attribute(k, hit), bsdf.eval_attribute_1(k, si, hit), 0)
-                   for k in ("roughness", "metallic")]
+        scalars = [
+            dr.select(bsdf.has_attribute(k, hit), bsdf.eval_attribute_1(k, si, hit), 0) for k in ("roughness", "metallic")
+        ]
         values = [dr.select(hit, v, 0) for v in (depth, *normal, *albedo, *scalars, mi.Float(1))]
-        dr.eval(values)         # together: one kernel, rays traced once
+        dr.eval(values)  # together: one kernel, rays traced once
         maps = np.stack([np.array(dr.block_sum(v, n * n)) for v in values], -1) / (n * n)
         maps[:, :-1] /= np.maximum(maps[:, -1:], 1e-9)
         maps[:, 1:4] /= np.maximum(np.linalg.norm(maps[:, 1:4], axis=1, keepdims=True), 1e-9)
@@ -178,6 +191,7 @@ def _write_view(stem: Path, rgba: np.ndarray, aov: np.ndarray):
 
 
 # ---- The data set ----
+
 
 def _digest(path: Path, seen: set) -> str:
     """A hash of a scene file and of the files that it names, includes followed."""
@@ -244,9 +258,19 @@ def _frame(split: str, index: int, camera: Camera) -> dict:
     return {"file_path": f"./{split}/r_{index}", "transform_matrix": (camera.to_world @ _CV_TO_BLENDER).tolist()}
 
 
-def render_dataset(xml, out, *, train: int = 60, test: int = 20, size: int = 400, spp: int = 25,
-                   radius: float | None = None, variables: dict | None = None, seed: int = 0,
-                   quiet: bool = False) -> Path:
+def render_dataset(
+    xml,
+    out,
+    *,
+    train: int = 60,
+    test: int = 20,
+    size: int = 400,
+    spp: int = 25,
+    radius: float | None = None,
+    variables: dict | None = None,
+    seed: int = 0,
+    quiet: bool = False,
+) -> Path:
     """Render a Mitsuba scene into a data set in the Blender layout (see the module), or return the one that is there.
 
     Args:
@@ -265,9 +289,17 @@ def render_dataset(xml, out, *, train: int = 60, test: int = 20, size: int = 400
             raise UserError(f"{name} is {value}: needs at least 1")
     if not xml.is_file():
         raise UserError(f"no scene at {xml}: check the path")
-    key = {"scene": _digest(xml.resolve(), set()), "variables": {k: str(v) for k, v in sorted(variables.items())},
-           "train": train, "test": test, "size": size, "spp": spp, "radius": radius, "seed": seed,
-           "code": _code_digest()}
+    key = {
+        "scene": _digest(xml.resolve(), set()),
+        "variables": {k: str(v) for k, v in sorted(variables.items())},
+        "train": train,
+        "test": test,
+        "size": size,
+        "spp": spp,
+        "radius": radius,
+        "seed": seed,
+        "code": _code_digest(),
+    }
     if _prepare(out, key):
         return out
 
@@ -278,8 +310,10 @@ def render_dataset(xml, out, *, train: int = 60, test: int = 20, size: int = 400
         raise UserError(f"{xml}: {error}") from error
     distance = radius or MARGIN * extent / math.sin(math.radians(FOV / 2))
     directions = {"train": train_directions(train, seed), "test": test_directions(test, seed)}
-    cameras = {split: [Camera.look_at(center + distance * d, center, (0, 0, 1), FOV, (size, size)) for d in ds]
-               for split, ds in directions.items()}
+    cameras = {
+        split: [Camera.look_at(center + distance * d, center, (0, 0, 1), FOV, (size, size)) for d in ds]
+        for split, ds in directions.items()
+    }
     views = [(split, i, camera) for split, cs in cameras.items() for i, camera in enumerate(cs)]
     renderer = Renderer(scene, size)
     with Progress(quiet=quiet, label=f"rendering {xml.name}") as progress:
@@ -294,4 +328,3 @@ def render_dataset(xml, out, *, train: int = 60, test: int = 20, size: int = 400
         _write_json(out / f"transforms_{split}.json", {"camera_angle_x": math.radians(FOV), "frames": frames})
     _write_json(out / "truth.json", {"key": key, "complete": True})
     return out
-

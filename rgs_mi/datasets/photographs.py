@@ -41,14 +41,19 @@ class Photographs:
         camera, (x, y, width, height) = self.views[i].camera, self._windows[i]
         if i not in self._images:
             whole = self._whole(i)
-            window = whole[y:y + height, x:x + width].transpose(2, 0, 1).reshape(whole.shape[2], -1)
+            window = whole[y : y + height, x : x + width].transpose(2, 0, 1).reshape(whole.shape[2], -1)
             # Half precision keeps colours; of depths it would make steps.
             self._images[i] = window[:4].astype(np.float16), window[4:].copy(), whole.shape[1::-1]
         color, depth, size = self._images[i]
         planes = [lanes(plane) for plane in color]
-        return Photograph(camera.resized(*size).cropped(x, y, width, height),
-                          mi.Color3f(*planes[:3]) + self.background * (1 - planes[3]), planes[3],
-                          lanes(depth) if len(depth) else None, bool(self.priors and self.priors[i].inverse), size)
+        return Photograph(
+            camera.resized(*size).cropped(x, y, width, height),
+            mi.Color3f(*planes[:3]) + self.background * (1 - planes[3]),
+            planes[3],
+            lanes(depth) if len(depth) else None,
+            bool(self.priors and self.priors[i].inverse),
+            size,
+        )
 
     def _whole(self, i):
         """[H, W, 4 or 5] of this level: colour, coverage and, where there is one, the prior."""

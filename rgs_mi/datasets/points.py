@@ -11,8 +11,18 @@ from plyfile import PlyData, PlyParseError
 from ..core.color import srgb_decode
 from ..core.errors import UserError
 
-FILES = ("points3d.ply", "points3D.ply", "points.ply", "sparse/0/points3D.ply", "sparse/0/points3D.bin",
-         "sparse/0/points3D.txt", "sparse/points3D.bin", "sparse/points3D.txt", "points3D.bin", "points3D.txt")
+FILES = (
+    "points3d.ply",
+    "points3D.ply",
+    "points.ply",
+    "sparse/0/points3D.ply",
+    "sparse/0/points3D.bin",
+    "sparse/0/points3D.txt",
+    "sparse/points3D.bin",
+    "sparse/points3D.txt",
+    "points3D.bin",
+    "points3D.txt",
+)
 FARTHEST = 1e6  # as for cameras; a coordinate beyond is damage or an outlier that no photograph shows
 _PLY_HEADER_LIMIT = 1 << 20  # bytes
 _COLMAP_POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
@@ -36,13 +46,15 @@ def sparse_points(root: Path, files=FILES) -> tuple[np.ndarray, np.ndarray | Non
         _check(positions, encoded)
     except (OSError, PlyParseError, ValueError, OverflowError, MemoryError) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise UserError(f"{path} cannot be used as a point cloud ({reason}): export it again, or remove it to start "
-                        "without one") from error
+        raise UserError(
+            f"{path} cannot be used as a point cloud ({reason}): export it again, or remove it to start without one"
+        ) from error
     return positions.astype(np.float32), None if encoded is None else srgb_decode(encoded).astype(np.float32)
 
 
 # The readers return positions [N, 3] and sRGB-encoded colours [N, 3] (or None), both float64, of whatever the file says;
 # they, and `_check`, raise a ValueError whose message is the reason alone.
+
 
 def _check(positions, encoded):
     if not len(positions):
@@ -55,6 +67,7 @@ def _check(positions, encoded):
 
 
 # ---- PLY ----
+
 
 def _read_ply(path):
     """``x y z`` and, if all three are there, ``red green blue`` of the vertices; ASCII or binary of either order."""
@@ -101,6 +114,7 @@ def _check_ply_header(head: bytes, size: int):
 
 
 # ---- COLMAP ----
+
 
 def _read_colmap_text(path):
     """``POINT3D_ID X Y Z R G B ERROR TRACK...`` in each line but comments (#)."""

@@ -32,21 +32,21 @@ def read_json(file: Path) -> dict:
     except OSError as error:
         raise UserError(f"{file} cannot be read ({error.strerror}): the layout needs it") from error
     except json.JSONDecodeError as error:
-        raise UserError(f"{file}: malformed JSON at line {error.lineno}, column {error.colno} ({error.msg}): "
-                        f"fix it or export again") from error
+        raise UserError(
+            f"{file}: malformed JSON at line {error.lineno}, column {error.colno} ({error.msg}): fix it or export again"
+        ) from error
     except (ValueError, RecursionError) as error:  # not UTF-8, an integer of thousands of digits, absurd nesting
         reason = str(error).splitlines()[0]
         raise UserError(f"{file}: not a JSON text file ({reason}): export it again") from error
     if not isinstance(meta, dict):
-        raise UserError(f"{file}: the outermost value must be an object with \"frames\"")
+        raise UserError(f'{file}: the outermost value must be an object with "frames"')
     if not isinstance(meta.get("frames"), list):
-        raise UserError(f"{file}: \"frames\" is missing or not a list")
+        raise UserError(f'{file}: "frames" is missing or not a list')
     if not meta["frames"]:
-        raise UserError(f"{file}: \"frames\" is empty: at least one frame is needed")
+        raise UserError(f'{file}: "frames" is empty: at least one frame is needed')
     for index, frame in enumerate(meta["frames"]):
         if not isinstance(frame, dict):
-            raise UserError(f"{file}: frame {index} is not an object: "
-                            "write {\"file_path\": ..., \"transform_matrix\": ...}")
+            raise UserError(f'{file}: frame {index} is not an object: write {{"file_path": ..., "transform_matrix": ...}}')
     return meta
 
 
@@ -58,12 +58,17 @@ def frame_of(file: Path, meta: dict, index: int, smaller=None) -> Frame:
     frame, where = meta["frames"][index], f"{file}: frame {index}"
     name = frame.get("file_path")
     if not isinstance(name, str) or not name.strip("./"):
-        raise UserError(f"{where}: \"file_path\" is missing or not a file name")
+        raise UserError(f'{where}: "file_path" is missing or not a file name')
     path = find_image(smaller(file.parent / name) if smaller else file.parent / name)
     missing = path is None
-    return Frame(where, image_stem(Path(name)).name, Path(name) if missing else path,
-                 None if missing else partial(_camera, meta, frame, where, _pose(frame, where)),
-                 _distortion(meta, frame, where), missing=missing)
+    return Frame(
+        where,
+        image_stem(Path(name)).name,
+        Path(name) if missing else path,
+        None if missing else partial(_camera, meta, frame, where, _pose(frame, where)),
+        _distortion(meta, frame, where),
+        missing=missing,
+    )
 
 
 def image_stem(path: Path) -> Path:
@@ -89,8 +94,9 @@ def number(meta: dict, frame: dict, key: str, default, limits, unit: str, where:
     except TypeError:
         found = float("nan")
     if not limits[0] < found < limits[1]:
-        raise UserError(f"{where}: \"{key}\" is {str(value)[:40]!r}: give a number of {unit} "
-                        f"between {limits[0]:g} and {limits[1]:g}")
+        raise UserError(
+            f'{where}: "{key}" is {str(value)[:40]!r}: give a number of {unit} between {limits[0]:g} and {limits[1]:g}'
+        )
     return found
 
 
@@ -114,9 +120,9 @@ def _float(value) -> float:
 
 def _pose(frame: dict, where: str) -> np.ndarray:
     """[4, 4] rigid camera-to-world matrix in `Camera`'s convention."""
-    remedy = "\"transform_matrix\" must be a rigid 4x4 camera-to-world matrix"
+    remedy = '"transform_matrix" must be a rigid 4x4 camera-to-world matrix'
     if "transform_matrix" not in frame:
-        raise UserError(f"{where}: \"transform_matrix\" is missing")
+        raise UserError(f'{where}: "transform_matrix" is missing')
     pose = matrix(frame["transform_matrix"], where, remedy)
     if pose.shape != (4, 4):
         raise UserError(f"{where}: the matrix has shape {pose.shape}: {remedy}")
@@ -126,8 +132,10 @@ def _pose(frame: dict, where: str) -> np.ndarray:
 def _distortion(meta: dict, frame: dict, where: str) -> Distortion:
     model = frame.get("camera_model", meta.get("camera_model", "PINHOLE"))
     if model not in PERSPECTIVE or frame.get("is_fisheye", meta.get("is_fisheye", False)):
-        raise UserError(f"{where}: its \"camera_model\" {str(model)[:40]!r} is no perspective lens with Brown's distortion "
-                        f"({', '.join(PERSPECTIVE)}): undistort the photographs first")
+        raise UserError(
+            f'{where}: its "camera_model" {str(model)[:40]!r} is no perspective lens with Brown\'s distortion '
+            f"({', '.join(PERSPECTIVE)}): undistort the photographs first"
+        )
     get = lambda key: number(meta, frame, key, 0.0, _COEFFICIENT_LIMITS, "distortion", where)
     return Distortion(tuple(map(get, ("k1", "k2", "k3", "k4"))), tangential=(get("p1"), get("p2")))
 
@@ -140,7 +148,7 @@ def _camera(meta: dict, frame: dict, where: str, to_world: np.ndarray, photograp
     if fx is None:
         fov = get("camera_angle_x", None, (1e-4, 3.1), "radians")
         if fov is None:
-            raise UserError(f"{where}: neither \"camera_angle_x\" nor \"fl_x\" is given: add one of them to the file")
+            raise UserError(f'{where}: neither "camera_angle_x" nor "fl_x" is given: add one of them to the file')
         fx = 0.5 * size[0] / np.tan(0.5 * fov)
     fy = get("fl_y", fx, FOCAL_LIMITS)
     principal = (get("cx", size[0] / 2, _POINT_LIMITS), get("cy", size[1] / 2, _POINT_LIMITS))

@@ -21,10 +21,10 @@ SCORES = ("psnr", "ssim", "lpips", "lpips_alex", "normal_mae_deg", "normal_ssim"
 class Rendering:
     """A rendered view as NumPy arrays, float32.
 
-      image:  [H, W, 3] display values in [0, 1] over the background, what is compared with the photograph
-      alpha:  [H, W, 1] coverage
-      maps:   name -> [H, W, channels], premultiplied by coverage: color, diffuse, specular (linear radiance), normal
-              (world space, unit length before), base_color, roughness, metallic, depth
+    image:  [H, W, 3] display values in [0, 1] over the background, what is compared with the photograph
+    alpha:  [H, W, 1] coverage
+    maps:   name -> [H, W, channels], premultiplied by coverage: color, diffuse, specular (linear radiance), normal
+            (world space, unit length before), base_color, roughness, metallic, depth
     """
 
     image: np.ndarray
@@ -42,9 +42,17 @@ def render_view(surfels, lighting, camera, background, spp=1) -> Rendering:
         m = image.gbuffer.all
         length = dr.norm(m.normal)
         normal = dr.select(length > 0, m.normal * (m.alpha / length), 0)
-        maps = {"color": image.color, "diffuse": image.diffuse, "specular": image.specular, "normal": normal,
-                "base_color": m.base_color, "roughness": m.roughness, "metallic": m.metallic, "depth": m.depth,
-                "alpha": m.alpha}
+        maps = {
+            "color": image.color,
+            "diffuse": image.diffuse,
+            "specular": image.specular,
+            "normal": normal,
+            "base_color": m.base_color,
+            "roughness": m.roughness,
+            "metallic": m.metallic,
+            "depth": m.depth,
+            "alpha": m.alpha,
+        }
         dr.eval(maps)
         samples = {k: np.atleast_2d(v.numpy()).T.reshape(height, side, width, side, -1) for k, v in maps.items()}
         means = {k: v.mean((1, 3)) for k, v in samples.items()}
@@ -71,12 +79,18 @@ def score(view, rendering: Rendering, background) -> dict:
     distance = lpips.distance if lpips.installed() else lambda *_: float("nan")
     pair = rendering.image, photograph(view, background)
     figures = dict.fromkeys(SCORES) | {
-        "psnr": metrics.psnr(*pair), "ssim": metrics.ssim(*pair),
-        "lpips": _finite(distance(*pair, "vgg")), "lpips_alex": _finite(distance(*pair, "alex"))}
+        "psnr": metrics.psnr(*pair),
+        "ssim": metrics.ssim(*pair),
+        "lpips": _finite(distance(*pair, "vgg")),
+        "lpips_alex": _finite(distance(*pair, "alex")),
+    }
     if view.normal is not None:
         pair = _normal_pictures(view, rendering)
-        figures |= {"normal_mae_deg": _finite(metrics.normal_mae_deg(rendering.maps["normal"], view.normal, view.alpha)),
-                    "normal_ssim": metrics.ssim(*pair), "normal_lpips": _finite(distance(*pair, "vgg"))}
+        figures |= {
+            "normal_mae_deg": _finite(metrics.normal_mae_deg(rendering.maps["normal"], view.normal, view.alpha)),
+            "normal_ssim": metrics.ssim(*pair),
+            "normal_lpips": _finite(distance(*pair, "vgg")),
+        }
     return figures
 
 

@@ -27,12 +27,12 @@ _BAND = 256  # rows of a product of matrices: enough to be fast, few enough for 
 class _Layout:
     """A network down to its last layer that is compared.
 
-      file:    of its weights
-      name:    of its part in that file
-      first:   (size, stride, padding) of the first convolution; those of the others are (size, 1, size // 2)
-      sizes:   of the other convolutions
-      stages:  (window of the maximum taken before it, or 0; its convolutions): the end of each stage is compared
-      minimum: pixels of the smallest image
+    file:    of its weights
+    name:    of its part in that file
+    first:   (size, stride, padding) of the first convolution; those of the others are (size, 1, size // 2)
+    sizes:   of the other convolutions
+    stages:  (window of the maximum taken before it, or 0; its convolutions): the end of each stage is compared
+    minimum: pixels of the smallest image
     """
 
     file: str
@@ -76,12 +76,14 @@ def _difference(maps, weight):
     """Mean over pixels of Σ_c w_c (â_c − b̂_c)²; ``weight``: [C]."""
     unit = lambda x: x / (np.sqrt(np.einsum("nc,nc->n", x, x)) + 1e-10)[:, None]
     a, b = maps.index
-    total = sum(float(((unit(maps.values[a[y, x]]) - unit(maps.values[b[y, x]]))**2 @ weight).sum())
-                for y, x in _bands(a != b))
+    total = sum(
+        float(((unit(maps.values[a[y, x]]) - unit(maps.values[b[y, x]])) ** 2 @ weight).sum()) for y, x in _bands(a != b)
+    )
     return total / a.size
 
 
 # ---- Weights ----
+
 
 def installed() -> bool:
     """Whether there are weights."""
@@ -103,6 +105,7 @@ def _stages(network):
 
 def _checked(layout, parameters):
     """`_stages` of a file's ``parameters``. Raises: some exception where one is missing or not as it should be."""
+
     def array(shape, *names):
         value = functools.reduce(lambda group, name: group[name], names, parameters)
         if value.shape != shape or not np.isfinite(value).all():
@@ -117,22 +120,30 @@ def _checked(layout, parameters):
             size, stride, padding = next(shapes)
             names = layout.name, f"Conv_{k}"
             outputs = len(parameters[names[0]][names[1]]["bias"])
-            convolutions.append((array((size, size, channels, outputs), *names, "kernel"),
-                                 array((outputs,), *names, "bias"), stride, padding))
+            convolutions.append(
+                (
+                    array((size, size, channels, outputs), *names, "kernel"),
+                    array((outputs,), *names, "bias"),
+                    stride,
+                    padding,
+                )
+            )
             channels, k = outputs, k + 1
-        stages.append((window, convolutions,
-                       array((1, 1, channels, 1), f"NetLinLayer_{number}", "Conv_0", "kernel").reshape(-1)))
+        stages.append(
+            (window, convolutions, array((1, 1, channels, 1), f"NetLinLayer_{number}", "Conv_0", "kernel").reshape(-1))
+        )
     return stages
 
 
 # ---- Layers ----
 
+
 @dataclass
 class _Maps:
     """What a layer makes of N images. The pixels of a uniform background share their values, which are computed once.
 
-      values: [2 + P, C] of pixels outside (zeros), of the background, and of each other pixel
-      index:  [N, H, W] where in ``values`` those of a pixel are
+    values: [2 + P, C] of pixels outside (zeros), of the background, and of each other pixel
+    index:  [N, H, W] where in ``values`` those of a pixel are
     """
 
     values: np.ndarray
@@ -157,9 +168,14 @@ class _Maps:
         """[N, H', W'] of which windows all pixels are of the background."""
         plain = np.pad(self.index == 1, ((0, 0), (padding, padding), (padding, padding)))
         height, width = ((n - size) // stride + 1 for n in plain.shape[1:])
-        return functools.reduce(np.logical_and, [
-            plain[:, i:i + stride * (height - 1) + 1:stride, j:j + stride * (width - 1) + 1:stride]
-            for i in range(size) for j in range(size)])
+        return functools.reduce(
+            np.logical_and,
+            [
+                plain[:, i : i + stride * (height - 1) + 1 : stride, j : j + stride * (width - 1) + 1 : stride]
+                for i in range(size)
+                for j in range(size)
+            ],
+        )
 
 
 def _maximum(maps, window):
@@ -192,8 +208,17 @@ def _product(maps, result, kernel, bias, stride, padding):
 
 
 # Lavin and Gray 2016, F(4x4, 3x3): 4 outputs of a correlation with 3 values g from 6 inputs d are A((G g) (B d)).
-_B = np.array([[4, 0, -5, 0, 1, 0], [0, -4, -4, 1, 1, 0], [0, 4, -4, -1, 1, 0],
-               [0, -2, -1, 2, 1, 0], [0, 2, -1, -2, 1, 0], [0, 4, 0, -5, 0, 1]], np.float32)
+_B = np.array(
+    [
+        [4, 0, -5, 0, 1, 0],
+        [0, -4, -4, 1, 1, 0],
+        [0, 4, -4, -1, 1, 0],
+        [0, -2, -1, 2, 1, 0],
+        [0, 2, -1, -2, 1, 0],
+        [0, 4, 0, -5, 0, 1],
+    ],
+    np.float32,
+)
 _G = np.array([[6, 0, 0], [-4, -4, -4], [-4, 4, -4], [1, 2, 4], [1, -2, 4], [0, 0, 24]], np.float32) / 24
 _A = np.array([[1, 1, 1, 1, 1, 0], [0, 1, -1, 2, -2, 0], [0, 1, 1, 4, 4, 0], [0, 1, -1, 8, -8, 1]], np.float32)
 _B, _G, _A = (np.kron(matrix, matrix) for matrix in (_B, _G, _A))  # rows and columns at once
@@ -221,4 +246,4 @@ def _bands(mask):
     """Where ``mask`` is true, `_BAND` places at a time: a [T] array an axis."""
     places = np.argwhere(mask)
     for start in range(0, len(places), _BAND):
-        yield places[start:start + _BAND].T
+        yield places[start : start + _BAND].T

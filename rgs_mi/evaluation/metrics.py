@@ -17,8 +17,17 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
     """
     from skimage.metrics import structural_similarity
 
-    return float(structural_similarity(np.asarray(a, np.float64), np.asarray(b, np.float64), data_range=1.0,
-                                       channel_axis=-1, gaussian_weights=True, sigma=1.5, use_sample_covariance=False))
+    return float(
+        structural_similarity(
+            np.asarray(a, np.float64),
+            np.asarray(b, np.float64),
+            data_range=1.0,
+            channel_axis=-1,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+        )
+    )
 
 
 def normal_mae_deg(normal: np.ndarray, truth: np.ndarray, alpha: np.ndarray) -> float:

@@ -14,8 +14,17 @@ ERROR_RANGE, NORMAL_RANGE = 0.2, 20  # what the ramp of errors ends at: display 
 RAMP = np.array([[255, 255, 255], [250, 214, 122], [235, 130, 56], [184, 51, 69], [84, 18, 74]]) / 255
 _PANEL, _GAP, _MARGIN, _TEXT = 280, 12, 32, 24  # pixels of the contact sheet
 _INK = (60, 60, 60)
-_ON_SHEET = ("photograph", "rendering", "normals", "true normals", "roughness", "metallic", "base color", "diffuse",
-             "specular")
+_ON_SHEET = (
+    "photograph",
+    "rendering",
+    "normals",
+    "true normals",
+    "roughness",
+    "metallic",
+    "base color",
+    "diffuse",
+    "specular",
+)
 
 
 def write_view(folder, view, rendering: Rendering, background, gbuffer: bool):
@@ -27,12 +36,16 @@ def write_view(folder, view, rendering: Rendering, background, gbuffer: bool):
     write_png(folder / f"{view.name}_compare.png", np.concatenate([truth, rendering.image, error], 1))
     if gbuffer:
         maps = rendering.maps | {"alpha": rendering.alpha}
-        names = [f"{name}.{c}" for name, m in maps.items() for c in
-                 ("Y" if m.shape[-1] == 1 else "XYZ" if name == "normal" else "RGB")]
+        names = [
+            f"{name}.{c}"
+            for name, m in maps.items()
+            for c in ("Y" if m.shape[-1] == 1 else "XYZ" if name == "normal" else "RGB")
+        ]
         write_exr(folder / f"{view.name}_gbuffer.exr", np.concatenate(list(maps.values()), -1), names)
 
 
 # ---- Panels ----
+
 
 def panels(view, rendering: Rendering, background) -> dict[str, np.ndarray]:
     """A view taken apart: name -> [H, W, 3] uint8 over white, all cropped to the object.
@@ -46,18 +59,25 @@ def panels(view, rendering: Rendering, background) -> dict[str, np.ndarray]:
     over_white = lambda premultiplied: premultiplied + (1 - alpha)
     mean = lambda name: maps[name] / np.maximum(alpha, 1e-6)
     light = lambda name: over_white(srgb_encode(np.clip(mean(name), 0, 1)) * alpha)
-    images = {"photograph": truth, "rendering": rendering.image,
-              "error": ramp(np.abs(rendering.image - truth).mean(-1) / ERROR_RANGE),
-              "normals": metrics.normal_colors(maps["normal"], alpha[..., 0])}
+    images = {
+        "photograph": truth,
+        "rendering": rendering.image,
+        "error": ramp(np.abs(rendering.image - truth).mean(-1) / ERROR_RANGE),
+        "normals": metrics.normal_colors(maps["normal"], alpha[..., 0]),
+    }
     if view.normal is not None:
         known = np.linalg.norm(view.normal, axis=-1, keepdims=True) > 0.5
         images["true normals"] = metrics.normal_colors(view.normal * known, known[..., 0])
         angles = metrics.normal_angles_deg(maps["normal"], view.normal)
         images["normal error"] = np.where(known, ramp(angles / NORMAL_RANGE), 1)
-    images |= {"depth": over_white(alpha * _nearness(mean("depth"), alpha > 0.5)).repeat(3, -1),
-               "roughness": over_white(maps["roughness"]).repeat(3, -1),
-               "metallic": over_white(maps["metallic"]).repeat(3, -1), "base color": light("base_color"),
-               "diffuse": light("diffuse"), "specular": light("specular")}
+    images |= {
+        "depth": over_white(alpha * _nearness(mean("depth"), alpha > 0.5)).repeat(3, -1),
+        "roughness": over_white(maps["roughness"]).repeat(3, -1),
+        "metallic": over_white(maps["metallic"]).repeat(3, -1),
+        "base color": light("base_color"),
+        "diffuse": light("diffuse"),
+        "specular": light("specular"),
+    }
     return crop({name: to_8bit(image) for name, image in images.items()}, view)
 
 
@@ -82,10 +102,11 @@ def crop(panels, view):
     height, width = view.pixels.shape[:2]
     side = min(height, width, round(1.06 * max(np.ptp(x), np.ptp(y))) + 2)
     left, top = (int(np.clip((v.min() + v.max() - side) // 2, 0, n - side)) for v, n in ((x, width), (y, height)))
-    return {name: image[top:top + side, left:left + side] for name, image in panels.items()}
+    return {name: image[top : top + side, left : left + side] for name, image in panels.items()}
 
 
 # ---- The contact sheet ----
+
 
 def contact_sheet(path, rows, environment: np.ndarray, title: str, lines):
     """One picture of the fit: a row for each view's `panels` of ``rows``; below them the ``environment``

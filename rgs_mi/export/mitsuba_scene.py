@@ -27,9 +27,18 @@ def export(folder, scene, surfels, environment, shading, indirect, shader, views
     write_exr(folder / ENVIRONMENT, environment.texels.numpy())
     if shader:
         shader.save(folder / SHADER)
-    root = _fitted(scene, surfels, environment, {"specular": shading.specular, "diffuse": shading.diffuse,
-                                                 "indirect": indirect, "shader": SHADER if shader else None,
-                                                 "box": shading.box})
+    root = _fitted(
+        scene,
+        surfels,
+        environment,
+        {
+            "specular": shading.specular,
+            "diffuse": shading.diffuse,
+            "indirect": indirect,
+            "shader": SHADER if shader else None,
+            "box": shading.box,
+        },
+    )
     if any(abs(v.camera.focal[0] / v.camera.focal[1] - 1) > 1e-4 for v in views):
         warnings.warn(f"{folder / SCENE}: the cameras' pixels are not square, those of its sensors are", stacklevel=2)
     root.extend(_sensor(view, spp) for view in views)
@@ -76,19 +85,32 @@ def _sensor(view, spp):
     sensor = ET.Element("sensor", type="perspective", id=sensor_id(view.name))
     numbers = ("fov", "principal_point_offset_x", "principal_point_offset_y")
     film = ET.Element("film", type="hdrfilm")
-    film.extend([_element("integer", "width", d["film"]["width"]), _element("integer", "height", d["film"]["height"]),
-                 _element("string", "pixel_format", "rgba"), ET.Element("rfilter", type="box")])
+    film.extend(
+        [
+            _element("integer", "width", d["film"]["width"]),
+            _element("integer", "height", d["film"]["height"]),
+            _element("string", "pixel_format", "rgba"),
+            ET.Element("rfilter", type="box"),
+        ]
+    )
     sampler = ET.Element("sampler", type="independent")
     sampler.append(_element("integer", "sample_count", spp))
-    sensor.extend([_transform(np.array(d["to_world"].matrix)), _element("string", "fov_axis", "x"),
-                   *(_element("float", name, f"{d[name]:.9g}") for name in numbers), film, sampler])
+    sensor.extend(
+        [
+            _transform(np.array(d["to_world"].matrix)),
+            _element("string", "fov_axis", "x"),
+            *(_element("float", name, f"{d[name]:.9g}") for name in numbers),
+            film,
+            sampler,
+        ]
+    )
     return sensor
 
 
 def _transform(matrix):
     """A ``to_world`` from [3, 3] or [4, 4]."""
     full = np.eye(4)
-    full[:len(matrix), :len(matrix)] = matrix
+    full[: len(matrix), : len(matrix)] = matrix
     transform = ET.Element("transform", name="to_world")
     ET.SubElement(transform, "matrix", value=" ".join(f"{v:.9g}" for v in full.ravel()))
     return transform

@@ -39,8 +39,10 @@ def _load(envmap):
     if str(envmap) in environments.ENVIRONMENTS:
         return mi.load_dict({"type": "procedural_envmap", "name": str(envmap)})
     if not Path(envmap).is_file():
-        raise UserError(f"no environment map at {envmap}: check the path, or name one of the suite's: "
-                        f"{', '.join(sorted(environments.ENVIRONMENTS))}")
+        raise UserError(
+            f"no environment map at {envmap}: check the path, or name one of the suite's: "
+            f"{', '.join(sorted(environments.ENVIRONMENTS))}"
+        )
     try:
         bitmap = mi.Bitmap(str(envmap))
     except RuntimeError as error:

@@ -26,8 +26,23 @@ _MOST = 10_000  # frames
 AOVS = ("albedo", "roughness", "metallic", "normal", "depth", "diffuse", "specular", "alpha")
 
 
-def render_scene(path, *, variables=None, view=None, turntable=None, along=None, filmed=False, size=None, spp=None,
-                 out=None, aovs=False, envmap=None, rotate=0.0, changes=(), quiet=False) -> list[Path]:
+def render_scene(
+    path,
+    *,
+    variables=None,
+    view=None,
+    turntable=None,
+    along=None,
+    filmed=False,
+    size=None,
+    spp=None,
+    out=None,
+    aovs=False,
+    envmap=None,
+    rotate=0.0,
+    changes=(),
+    quiet=False,
+) -> list[Path]:
     """Render a scene of surfels into PNGs with straight alpha, and return their paths.
 
     Args:
@@ -64,12 +79,16 @@ def render_scene(path, *, variables=None, view=None, turntable=None, along=None,
     if envmap is not None or rotate:
         relight(scene, path, envmap, rotate)
         if getattr(scene.integrator(), "diffuse", "lit") != "lit":
-            print(f"{path}: its diffuse radiance stays as photographed, only reflections change: "
-                  "fit with -D diffuse=lit to relight all of it", file=sys.stderr)
+            print(
+                f"{path}: its diffuse radiance stays as photographed, only reflections change: "
+                "fit with -D diffuse=lit to relight all of it",
+                file=sys.stderr,
+            )
     if changes:
         edit(scene, path, changes)
-    cameras = _circle(scene, path, turntable) if turntable else _along(scene, path, along) if moves else \
-        _view(scene, path, view)
+    cameras = (
+        _circle(scene, path, turntable) if turntable else _along(scene, path, along) if moves else _view(scene, path, view)
+    )
     out = Path(out) if out else path.parent / ("turntable" if turntable else "path" if moves else "renders")
     integrator = with_aovs(scene, path) if aovs else scene.integrator()
     spp = spp or spp_of(scene)
@@ -172,5 +191,8 @@ def with_aovs(scene, path):
         raise UserError(f"{path}: maps come from the integrator 'rgs_deferred' only: leave out --aovs")
     box = {"box": str(own.box)} if own.box else {}
     kept = ("specular", "diffuse", "samples", "indirect", "hide_emitters")
-    return mi.load_dict({"type": "rgs_deferred", "shader": own.shader_file, "aovs": ",".join(AOVS)} | box
-                        | {name: getattr(own, name) for name in kept})
+    return mi.load_dict(
+        {"type": "rgs_deferred", "shader": own.shader_file, "aovs": ",".join(AOVS)}
+        | box
+        | {name: getattr(own, name) for name in kept}
+    )

@@ -16,8 +16,10 @@ _SECONDS, _RATES = 6, (4, 30)  # about how long a video is, as far as these boun
 _CELLS, _COLUMNS, _WIDTH, _GAP = 12, 4, 320, 8  # frames on a sheet, in a row; pixels
 _QUALITY = ("-crf", "17", "-preset", "slow", "-movflags", "+faststart")
 # What players take for granted: without these, colours are converted one way and read another
-_COLORS = ("-vf", "scale=out_color_matrix=bt709:out_range=tv,"
-           "setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709:range=tv")
+_COLORS = (
+    "-vf",
+    "scale=out_color_matrix=bt709:out_range=tv,setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709:range=tv",
+)
 
 
 def check():
@@ -78,8 +80,15 @@ def _encode(path, frames, rate):
 
     with tempfile.TemporaryDirectory() as folder:
         file, first = Path(folder) / VIDEO, next(frames)
-        writer = imageio_ffmpeg.write_frames(str(file), first.shape[1::-1], fps=rate, codec="libx264", quality=None,
-                                             macro_block_size=1, output_params=[*_COLORS, *_QUALITY])
+        writer = imageio_ffmpeg.write_frames(
+            str(file),
+            first.shape[1::-1],
+            fps=rate,
+            codec="libx264",
+            quality=None,
+            macro_block_size=1,
+            output_params=[*_COLORS, *_QUALITY],
+        )
         try:
             writer.send(None)
             for frame in itertools.chain([first], frames):

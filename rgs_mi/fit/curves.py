@@ -1,7 +1,7 @@
 """How a fit went: what its steps measured, in a few hundred rows over its whole length.
 
-    curves.csv: step, seconds, surfels, pixels (width of the photographs) where a stretch of steps ends; psnr (dB, of the
-                training views), ms (a step) and loss.NAME (each part of the loss, weighted), means over the stretch
+curves.csv: step, seconds, surfels, pixels (width of the photographs) where a stretch of steps ends; psnr (dB, of the
+            training views), ms (a step) and loss.NAME (each part of the loss, weighted), means over the stretch
 """
 
 import csv

@@ -29,8 +29,10 @@ class Events:
             # not SummaryWriter: its thread dies of a full disk, and who waits for it hangs
             self._writer = EventsWriter(str(self.folder / "events"), f".{step}")
         except OSError as error:
-            raise UserError(f"{folder}: can't be written ({error.strerror or error}): check the folder's permissions and "
-                            "free space, or leave out --tensorboard") from error
+            raise UserError(
+                f"{folder}: can't be written ({error.strerror or error}): check the folder's permissions and "
+                "free space, or leave out --tensorboard"
+            ) from error
         if step > 0:  # what was written after the checkpoint that the fit goes on from no longer counts
             self._write(step + 1, session_log=SessionLog(status=SessionLog.START))
 

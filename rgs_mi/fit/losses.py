@@ -73,7 +73,7 @@ def ssim(image, target, size):
         blurred = dr.custom(_Blur, [*target, *(target * target)], size)
     mu_y, yy = mi.Color3f(*blurred[:3]), mi.Color3f(*blurred[3:])
     blurred = dr.custom(_Blur, [*image, *(image * image), *(image * target)], size)
-    mu_x, xx, xy = (mi.Color3f(*blurred[3 * k: 3 * k + 3]) for k in range(3))
+    mu_x, xx, xy = (mi.Color3f(*blurred[3 * k : 3 * k + 3]) for k in range(3))
     var_x, var_y, cov = xx - mu_x * mu_x, yy - mu_y * mu_y, xy - mu_x * mu_y
     value = ((2 * mu_x * mu_y + _C1) * (2 * cov + _C2)) / ((mu_x * mu_x + mu_y * mu_y + _C1) * (var_x + var_y + _C2))
     return dr.mean(dr.mean(value))
@@ -118,8 +118,9 @@ def depth_normal_consistency(gbuffer, camera):
     def point(i):
         m = gbuffer.maps(i)
         z = m.depth / m.alpha
-        return mi.Vector3f((mi.Float(i % width) + 0.5 - principal.x) / f.x * z,
-                           (mi.Float(i // width) + 0.5 - principal.y) / f.y * z, z)
+        return mi.Vector3f(
+            (mi.Float(i % width) + 0.5 - principal.x) / f.x * z, (mi.Float(i // width) + 0.5 - principal.y) / f.y * z, z
+        )
 
     n_depth = dr.normalize(dr.cross(point(index + width) - point(index - width), point(index + 1) - point(index - 1)))
     n = dr.normalize(R @ gbuffer.maps(index).normal)
@@ -170,7 +171,7 @@ def fairness(gbuffer, reflective, corner=(0, 0)):
         triple = reflective & np.roll(reflective, apart, axis) & np.roll(reflective, -apart, axis)
         np.moveaxis(triple, axis, 0)[:apart] = np.moveaxis(triple, axis, 0)[-apart:] = False  # rolled in from the other side
         chosen = np.zeros_like(triple)
-        chosen[corner[0]::2, corner[1]::2] = triple[corner[0]::2, corner[1]::2]
+        chosen[corner[0] :: 2, corner[1] :: 2] = triple[corner[0] :: 2, corner[1] :: 2]
         index, step = dr.compress(lanes(chosen) > 0), dr.opaque(mi.UInt32, stride)
         if dr.width(index) == 0:
             continue

@@ -10,8 +10,19 @@ from ..shading.shader import Shader, initial_weights
 from ..surfels.surfels import SH_0, Surfels
 
 #: Unconstrained parameters, a row a surfel.
-SURFEL_PARAMETERS = ("centers", "rotations", "log_scales", "logit_opacities", "sh_dc", "sh_rest", "logit_base_color",
-                     "logit_roughness", "logit_metallic", "delta_normal", "curvature")
+SURFEL_PARAMETERS = (
+    "centers",
+    "rotations",
+    "log_scales",
+    "logit_opacities",
+    "sh_dc",
+    "sh_rest",
+    "logit_base_color",
+    "logit_roughness",
+    "logit_metallic",
+    "delta_normal",
+    "curvature",
+)
 ENVIRONMENT, SHADER = "log_environment", "shader"
 #: The step of 3DGS's optimisers is relative to the gradient's own size, however small.
 _EPSILON = 1e-15
@@ -44,8 +55,22 @@ class Model:
             self.optimizer[name] = tensor(value)
 
     @classmethod
-    def start(cls, positions, normals, colors, spacing, environment, rotation, sh_order, seed=0, scale=1.0,
-              opacity=0.7, roughness=0.3, shader="identity", two_sided=None):
+    def start(
+        cls,
+        positions,
+        normals,
+        colors,
+        spacing,
+        environment,
+        rotation,
+        sh_order,
+        seed=0,
+        scale=1.0,
+        opacity=0.7,
+        roughness=0.3,
+        shader="identity",
+        two_sided=None,
+    ):
         """Surfels at ``positions`` [N, 3], facing ``normals`` [N, 3] (None: random), of ``colors`` [N, 3] (linear), as wide
         as ``scale`` times their ``spacing`` [N], all of one ``opacity`` and ``roughness``; ``two_sided`` (None: where
         normals are random, else they point outwards); ``environment`` [rows, columns, 3] radiance to start from;
@@ -57,21 +82,25 @@ class Model:
         if normals is None:
             normals = rng.normal(size=(n, 3))
             normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        return cls({
-            "centers": positions,
-            "rotations": rotation_from_normal(normals, rng.uniform(0, 2 * np.pi, n)),
-            "log_scales": np.log(scale * np.repeat(spacing[:, None], 2, 1)),
-            "logit_opacities": np.full((n, 1), logit(opacity)),
-            "sh_dc": (0.5 * colors - 0.5) / SH_0,
-            "sh_rest": np.zeros((n, 3 * ((sh_order + 1) ** 2 - 1))),
-            "logit_base_color": np.full((n, 3), logit(0.5)),
-            "logit_roughness": np.full((n, 1), logit(roughness)),
-            "logit_metallic": np.full((n, 1), logit(0.4)),
-            "delta_normal": np.zeros((n, 3)),
-            "curvature": np.zeros((n, 3)),
-            ENVIRONMENT: np.log(np.maximum(environment, 1e-3)),
-            **({SHADER: initial_weights(seed)} if shader == "mlp" else {}),
-        }, rotation, two_sided)
+        return cls(
+            {
+                "centers": positions,
+                "rotations": rotation_from_normal(normals, rng.uniform(0, 2 * np.pi, n)),
+                "log_scales": np.log(scale * np.repeat(spacing[:, None], 2, 1)),
+                "logit_opacities": np.full((n, 1), logit(opacity)),
+                "sh_dc": (0.5 * colors - 0.5) / SH_0,
+                "sh_rest": np.zeros((n, 3 * ((sh_order + 1) ** 2 - 1))),
+                "logit_base_color": np.full((n, 3), logit(0.5)),
+                "logit_roughness": np.full((n, 1), logit(roughness)),
+                "logit_metallic": np.full((n, 1), logit(0.4)),
+                "delta_normal": np.zeros((n, 3)),
+                "curvature": np.zeros((n, 3)),
+                ENVIRONMENT: np.log(np.maximum(environment, 1e-3)),
+                **({SHADER: initial_weights(seed)} if shader == "mlp" else {}),
+            },
+            rotation,
+            two_sided,
+        )
 
     def __len__(self):
         return self.optimizer["centers"].shape[0]
@@ -86,9 +115,19 @@ class Model:
         if sh_order > 0:
             sh = dr.concat((sh, p["sh_rest"][:, : 3 * ((sh_order + 1) ** 2 - 1)]), axis=1)
         scales = dr.maximum(dr.exp(p["log_scales"]), _LEAST_SCALE)
-        return Surfels(p["centers"], p["rotations"], scales, _sigmoid(p["logit_opacities"]), sh,
-                       _sigmoid(p["logit_base_color"]), _sigmoid(p["logit_roughness"]), _sigmoid(p["logit_metallic"]),
-                       p["delta_normal"], p["curvature"], self.two_sided)
+        return Surfels(
+            p["centers"],
+            p["rotations"],
+            scales,
+            _sigmoid(p["logit_opacities"]),
+            sh,
+            _sigmoid(p["logit_base_color"]),
+            _sigmoid(p["logit_roughness"]),
+            _sigmoid(p["logit_metallic"]),
+            p["delta_normal"],
+            p["curvature"],
+            self.two_sided,
+        )
 
     def environment(self) -> Environment:
         """The environment, non-negative by construction."""
@@ -144,8 +183,12 @@ class Model:
         arrays = {"rotation": self.rotation, "two_sided": np.array(self.two_sided)}
         for name in self.optimizer.keys():
             t, m, v, _ = self.optimizer.state[name][3]
-            arrays |= {name: self.numpy(name), f"{name}.m": m.numpy(), f"{name}.v": v.numpy(),
-                       f"{name}.t": np.array(t).ravel()[0]}
+            arrays |= {
+                name: self.numpy(name),
+                f"{name}.m": m.numpy(),
+                f"{name}.v": v.numpy(),
+                f"{name}.t": np.array(t).ravel()[0],
+            }
         return arrays
 
     @classmethod

@@ -31,8 +31,11 @@ def boxes(mask: np.ndarray, least_pixels: int = 16) -> np.ndarray:
     [B, 4] of integers (x0, y0, x1, y1), in pixels, half-open. Boxes of one view may overlap."""
     components = measure.label(mask, connectivity=2)
     pixels = np.bincount(components.ravel())[1:]
-    around = [(x.start, y.start, x.stop, y.stop) for (y, x), n in zip(ndimage.find_objects(components), pixels)
-              if n >= least_pixels]
+    around = [
+        (x.start, y.start, x.stop, y.stop)
+        for (y, x), n in zip(ndimage.find_objects(components), pixels)
+        if n >= least_pixels
+    ]
     return np.array(around, np.intp).reshape(-1, 4)
 
 
@@ -60,7 +63,7 @@ def _inside(pixel, depth, found):
     right, bottom = found[:, 2:].max(0)
     union = np.zeros((bottom - top, right - left), bool)
     for x0, y0, x1, y1 in found:
-        union[y0 - top:y1 - top, x0 - left:x1 - left] = True
+        union[y0 - top : y1 - top, x0 - left : x1 - left] = True
     x, y = pixel.T
     inside = (depth > 0) & (x >= left) & (x < right) & (y >= top) & (y < bottom)
     at = np.flatnonzero(inside)
@@ -87,7 +90,7 @@ def picture(image: np.ndarray, mask: np.ndarray, found: np.ndarray, camera, cent
     seen = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     canvas[y[seen].astype(int), x[seen].astype(int)] = DOT
     for x0, y0, x1, y1 in found * scale:
-        inner = canvas[y0 + _LINE_WIDTH:y1 - _LINE_WIDTH, x0 + _LINE_WIDTH:x1 - _LINE_WIDTH].copy()
+        inner = canvas[y0 + _LINE_WIDTH : y1 - _LINE_WIDTH, x0 + _LINE_WIDTH : x1 - _LINE_WIDTH].copy()
         canvas[y0:y1, x0:x1] = LINE
-        canvas[y0 + _LINE_WIDTH:y1 - _LINE_WIDTH, x0 + _LINE_WIDTH:x1 - _LINE_WIDTH] = inner
+        canvas[y0 + _LINE_WIDTH : y1 - _LINE_WIDTH, x0 + _LINE_WIDTH : x1 - _LINE_WIDTH] = inner
     return canvas

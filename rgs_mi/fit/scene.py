@@ -62,8 +62,14 @@ class FitScene:
         root = _parse(path)
         if None in (cls.integrator_element(root), cls.surfels_element(root), cls.emitter_element(root)):
             raise UserError(f"{path}: integrator, surfels and environment must stand in this file, not in one it includes")
-        return cls(path, root, variables, Path(surfels.photographs), Environment.from_emitter(scene.environment()),
-                   Shading(integrator.specular, integrator.diffuse, integrator.samples, surfels.eta))
+        return cls(
+            path,
+            root,
+            variables,
+            Path(surfels.photographs),
+            Environment.from_emitter(scene.environment()),
+            Shading(integrator.specular, integrator.diffuse, integrator.samples, surfels.eta),
+        )
 
     @staticmethod
     def integrator_element(root):

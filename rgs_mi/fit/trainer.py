@@ -23,10 +23,21 @@ from .model import ENVIRONMENT, SHADER, Model
 from .reflection_guided import boxes, guided, picture, reflective_mask
 
 #: Rate of each parameter: the field of `Rates` that it obeys.
-_RATES = {"centers": "centers", "rotations": "rotations", "log_scales": "scales", "logit_opacities": "opacities",
-          "sh_dc": "sh_dc", "sh_rest": "sh_rest", "logit_base_color": "base_color", "logit_roughness": "roughness",
-          "logit_metallic": "metallic", "delta_normal": "delta_normal", "curvature": "curvature",
-          ENVIRONMENT: "environment", SHADER: "shader"}
+_RATES = {
+    "centers": "centers",
+    "rotations": "rotations",
+    "log_scales": "scales",
+    "logit_opacities": "opacities",
+    "sh_dc": "sh_dc",
+    "sh_rest": "sh_rest",
+    "logit_base_color": "base_color",
+    "logit_roughness": "roughness",
+    "logit_metallic": "metallic",
+    "delta_normal": "delta_normal",
+    "curvature": "curvature",
+    ENVIRONMENT: "environment",
+    SHADER: "shader",
+}
 _NORMALS, _HELD = ("rotations", "delta_normal", "curvature"), 0.1  # the part of their rates that they have at first
 _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
 # A mirror ball, its radius r 3/8 of the picture, turns what its middle reflects by 2/r a pixel: π r/2 rows are told apart
@@ -58,10 +69,17 @@ class Fit:
 
     def state(self) -> tuple[dict, dict]:
         """(arrays, meta) for a checkpoint: with `resume` the fit goes on as if it had not been interrupted."""
-        arrays = self.model.state() | {"gradient_sum": self.gradients.sum.numpy(),
-                                       "gradient_count": self.gradients.count.numpy()}
-        return arrays, {"step": self.step_number, "views_used": self.views_used, "elapsed": self.elapsed,
-                        "extent": self.extent, "curves": self.curves.rows}
+        arrays = self.model.state() | {
+            "gradient_sum": self.gradients.sum.numpy(),
+            "gradient_count": self.gradients.count.numpy(),
+        }
+        return arrays, {
+            "step": self.step_number,
+            "views_used": self.views_used,
+            "elapsed": self.elapsed,
+            "extent": self.extent,
+            "curves": self.curves.rows,
+        }
 
     @classmethod
     def resume(cls, dataset, settings, arrays: dict, meta: dict, **others) -> "Fit":
@@ -143,8 +161,9 @@ class Fit:
             return SplitSum(environment.filtered(), self.shading.eta)
         emitter = self.emitter if training else environment.emitter()
         samples, seed = (s.monte_carlo_samples, self.step_number) if training else (self.shading.samples, 0)
-        return MonteCarlo(environment.unfiltered(), emitter, self.shading.eta, samples, dr.opaque(mi.UInt32, seed),
-                          paired=training)
+        return MonteCarlo(
+            environment.unfiltered(), emitter, self.shading.eta, samples, dr.opaque(mi.UInt32, seed), paired=training
+        )
 
     @property
     def _samples_light(self):
@@ -182,8 +201,8 @@ class Fit:
         leaves = [type(v)(dr.detach(v)) for v in shared]
         dr.eval(leaves)
         dr.enable_grad(leaves)
-        surfels = Surfels(*leaves[:len(CHANNELS)], surfels.two_sided)
-        lighting = lighting and lighting.with_learned(leaves[len(CHANNELS):], surfels)
+        surfels = Surfels(*leaves[: len(CHANNELS)], surfels.two_sided)
+        lighting = lighting and lighting.with_learned(leaves[len(CHANNELS) :], surfels)
         measured = [self._view(i, surfels, lighting, 1 / len(views)) for i in views]
         for value, leaf in zip(shared, leaves):
             gradient = dr.grad(leaf)

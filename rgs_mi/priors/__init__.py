@@ -1,10 +1,10 @@
 """Depth priors: what is known of a photograph's depth before anything is fitted, one interface for all of them.
 
-    hull    the visual hull of the masks (`hull.py`): no network, and no reflection misleads it
-    stereo  that hull, less what the photographs look through (`stereo.py`)
-    files   maps of any estimator, one a photograph (`files.py`)
-    vggt    the foundation model (`vggt.py`), where its package and weights are
-    none
+hull    the visual hull of the masks (`hull.py`): no network, and no reflection misleads it
+stereo  that hull, less what the photographs look through (`stereo.py`)
+files   maps of any estimator, one a photograph (`files.py`)
+vggt    the foundation model (`vggt.py`), where its package and weights are
+none
 """
 
 import hashlib
@@ -81,6 +81,7 @@ def depth_priors(name: str, views, *, cache=None, **options) -> list[DepthPrior]
 
 # ---- The cache ----
 
+
 def _key(name, views, options) -> str:
     """A hash of all that the result depends on."""
     if name == "vggt":
@@ -101,8 +102,10 @@ def _load(path, views) -> list[DepthPrior] | None:
         return None
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            priors = [DepthPrior(arrays[f"values_{i}"], bool(arrays["inverse"][i]), arrays.get(f"confidence_{i}"))
-                      for i in range(len(views))]
+            priors = [
+                DepthPrior(arrays[f"values_{i}"], bool(arrays["inverse"][i]), arrays.get(f"confidence_{i}"))
+                for i in range(len(views))
+            ]
         for prior, view in zip(priors, views):
             for array in (prior.values, prior.confidence):
                 if array is not None and (array.shape != view.pixels.shape[:2] or array.dtype != np.float32):

@@ -43,8 +43,10 @@ def load(views, folder, inverse: bool = False, suffix: str = "") -> list[DepthPr
             raise UserError(f"{folder}: {problem} there as the depth map of {view.path or view.name}: {remedy}")
         values, (height, width) = _read(paths[0]), view.pixels.shape[:2]
         if abs(values.shape[0] * width / (values.shape[1] * height) - 1) > _ASPECT:
-            raise UserError(f"{paths[0]} is {values.shape[1]} x {values.shape[0]}, its photograph {width} x {height}: "
-                            "a depth map must show the whole photograph and no more")
+            raise UserError(
+                f"{paths[0]} is {values.shape[1]} x {values.shape[0]}, its photograph {width} x {height}: "
+                "a depth map must show the whole photograph and no more"
+            )
         priors.append(DepthPrior(outlined(resize(values, height, width), view), inverse))
     return priors
 

@@ -40,6 +40,7 @@ class SignedField:
 
 # ---- Silhouettes ----
 
+
 @dataclass(frozen=True)
 class _Silhouette:
     """One view's mask as a signed distance in pixels ([H, W] float32, positive inside), and its camera.
@@ -60,8 +61,9 @@ class _Silhouette:
         left, top, right, bottom = (0 if o else _PAD for o in open_)
         alpha = np.pad(alpha, ((top, bottom), (left, right)))
         height, width = alpha.shape
-        limits = [limit if o else sign * np.inf
-                  for o, limit, sign in zip(open_, (0, 0, width - 1, height - 1), (-1, -1, 1, 1))]
+        limits = [
+            limit if o else sign * np.inf for o, limit, sign in zip(open_, (0, 0, width - 1, height - 1), (-1, -1, 1, 1))
+        ]
         return cls(_signed_distance(alpha), camera.cropped(-left, -top, width, height), tuple(limits))
 
     def sample(self, points: np.ndarray) -> np.ndarray:
@@ -107,6 +109,7 @@ def _signed_distance(alpha: np.ndarray) -> np.ndarray:
 
 def _silhouettes(views) -> list[_Silhouette]:
     """The silhouettes of all masked views. Raises: UserError when fewer than two have a usable mask."""
+
     def one(view):
         alpha = view.alpha
         blank = (alpha > 0.5).all() or not (alpha > 0.5).any() or min(alpha.shape) < 2
@@ -115,8 +118,10 @@ def _silhouettes(views) -> list[_Silhouette]:
     with ThreadPoolExecutor() as pool:
         found = [s for s in pool.map(one, [v for v in views if v.masked]) if s is not None]
     if len(found) < 2:
-        raise UserError("a visual hull needs alpha masks in two views or more, and these photographs have none: "
-                        "give images with alpha, or a sparse point cloud (COLMAP, PLY), or start from random points")
+        raise UserError(
+            "a visual hull needs alpha masks in two views or more, and these photographs have none: "
+            "give images with alpha, or a sparse point cloud (COLMAP, PLY), or start from random points"
+        )
     return found
 
 
@@ -126,6 +131,7 @@ def _carve(silhouettes, points: np.ndarray, truncation: float) -> np.ndarray:
     Points drop out as soon as a view puts them further outside than the truncation. Points that fewer than a
     quarter of the views decide are outside, too.
     """
+
     def chunk(points):
         value = np.full(len(points), truncation, np.float32)
         count = np.zeros(len(points), np.int32)
@@ -178,8 +184,10 @@ def _object_box(silhouettes):
         # A cell counts while any part of it may be inside: its corners are at most 0.87 steps away.
         left = points[_carve(silhouettes, points, 2 * step) > -0.87 * step]
         if not len(left):
-            raise UserError("the silhouettes of the views have no common volume: check that the cameras belong to the "
-                            "images and follow the layout's convention")
+            raise UserError(
+                "the silhouettes of the views have no common volume: check that the cameras belong to the "
+                "images and follow the layout's convention"
+            )
         before = (upper - lower).max()
         lower, upper = np.maximum(left.min(0) - step, lower), np.minimum(left.max(0) + step, upper)
         if (upper - lower).max() > 0.9 * before:
@@ -238,6 +246,7 @@ def _field(silhouettes, box, resolution):
 
 
 # ---- The surface ----
+
 
 def surface(field: SignedField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The zero level: vertices [V, 3] (world), faces [F, 3] int32 (counter-clockwise from outside), outward unit

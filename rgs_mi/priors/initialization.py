@@ -11,8 +11,9 @@ _FAR = 10
 _SRGB_TO_LINEAR = srgb_decode(np.arange(256) / 255).astype(np.float32)
 
 
-def initial_points(dataset: Dataset, count: int, seed: int = 0, on_hull: bool = True, carve: bool = True,
-                   quiet: bool = True):
+def initial_points(
+    dataset: Dataset, count: int, seed: int = 0, on_hull: bool = True, carve: bool = True, quiet: bool = True
+):
     """Starting points of a fit to ``dataset.train``, world space, all float32.
 
     The surface of the visual hull (of `stereo.carved_hull` with ``carve``) where photographs have masks and ``on_hull`` is

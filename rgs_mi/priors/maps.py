@@ -1,6 +1,5 @@
 """One view's prior depth, and what all priors do with their maps."""
 
-
 import numpy as np
 
 

@@ -68,7 +68,7 @@ class Small:
         pixels = view.pixels / np.float32(255) if view.pixels.dtype == np.uint8 else view.pixels
         grey = np.clip(pixels[..., :3], 0, 1).mean(-1) * pixels[..., 3] + 1 - pixels[..., 3]
         w, h = width // factor, height // factor
-        grey = grey[:h * factor, :w * factor].reshape(h, factor, w, factor).mean((1, 3))
+        grey = grey[: h * factor, : w * factor].reshape(h, factor, w, factor).mean((1, 3))
         camera = view.camera.cropped(0, 0, w * factor, h * factor).resized(w, h)
         return cls(camera, np.ascontiguousarray(grey, np.float32))
 
@@ -80,6 +80,7 @@ class Small:
 
 
 # ---- How alike ----
+
 
 def sweep(i, small, depths, step):
     """[H, W] how much deeper than the hull the surface of view ``i`` lies, world units along the viewing axis; 0 where it is
@@ -93,7 +94,7 @@ def sweep(i, small, depths, step):
     mean = alikeness(here, depth, level, [(small[j], depths[j]) for j in _next_to(i, small)], 2 * step)
     mean[:, ~ndimage.binary_erosion(known, iterations=_WINDOW)] = -1
     found, top = mean.argmax(0), mean.max(0)
-    sure = (found > _ABOVE) & (found < _LEVELS - 2) & (top > _ALIKE) & (top - mean[:_ABOVE + 1].max(0) > _GAIN)
+    sure = (found > _ABOVE) & (found < _LEVELS - 2) & (top > _ALIKE) & (top - mean[: _ABOVE + 1].max(0) > _GAIN)
     deeper[window] = np.where(sure, level[found], 0)
     return deeper
 
@@ -103,7 +104,7 @@ def _next_to(i, small):
     forward = np.array([s.camera.rotation[2] for s in small])
     alike = forward @ forward[i]
     alike[i] = -np.inf
-    return np.argsort(-alike)[:min(_NEIGHBOURS, len(small) - 1)]
+    return np.argsort(-alike)[: min(_NEIGHBOURS, len(small) - 1)]
 
 
 def alikeness(here, depth, level, others, margin):
@@ -158,7 +159,7 @@ def _warp(points, other, depth, margin):
 def _own(grey, levels):
     """``grey``, its means and its mean squares over windows, a lane a level and pixel."""
     pixel = dr.arange(mi.UInt32, grey.size * levels) % dr.opaque(mi.UInt32, grey.size)
-    means = (ndimage.uniform_filter(grey.astype(np.float64)**k, 2 * _WINDOW + 1, mode="nearest") for k in (1, 2))
+    means = (ndimage.uniform_filter(grey.astype(np.float64) ** k, 2 * _WINDOW + 1, mode="nearest") for k in (1, 2))
     own = [dr.gather(mi.Float, lanes(image), pixel) for image in (grey, *means)]
     dr.eval(own)
     return own
@@ -193,11 +194,16 @@ def _means(images, width, height):
 
 # ---- What views agree on ----
 
+
 def _agreed(small, depths, deeper, step):
     """``deeper``, 0 where its points are not what the other views that look for them there have found, most of the time."""
     sure = [below > 0 for below in deeper]
-    points = np.concatenate([s.camera.origin + s.camera.rays()[where] * (depth + below)[where][:, None]
-                             for s, depth, below, where in zip(small, depths, deeper, sure)])
+    points = np.concatenate(
+        [
+            s.camera.origin + s.camera.rays()[where] * (depth + below)[where][:, None]
+            for s, depth, below, where in zip(small, depths, deeper, sure)
+        ]
+    )
     found, agree = np.zeros((2, len(points)), np.int64)
     for s, depth, below in zip(small, depths, deeper):
         z, (at, below_at) = _look(s.camera, points, depth, below)

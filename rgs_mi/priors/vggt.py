@@ -21,8 +21,10 @@ HUB = "facebook/VGGT-1B"
 _SIDE, _PATCH = 518, 14  # of the longer side after VGGT's preprocessing, and of a token, in pixels
 _NEEDED = ("aggregator.", "depth_head.")  # the parts of the network that depth takes
 _OTHERS = "the priors hull, files and none work without"
-_INSTALL = ("pip install torch torchvision einops huggingface_hub safetensors, then pip install --no-deps "
-            "git+https://github.com/facebookresearch/vggt")
+_INSTALL = (
+    "pip install torch torchvision einops huggingface_hub safetensors, then pip install --no-deps "
+    "git+https://github.com/facebookresearch/vggt"
+)
 
 
 def estimate(views, weights: str = HUB, batch: int = 24, overlap: int = 6, background: float = 1.0) -> list[DepthPrior]:
@@ -83,6 +85,7 @@ def fingerprint(weights: str) -> str:
 
 # ---- Photographs to the network and maps back ----
 
+
 def _write(path, view, background) -> str:
     """The photograph as a PNG over ``background``: the published loader reads files."""
     from PIL import Image
@@ -98,7 +101,7 @@ def _prior(view, depth, confidence) -> DepthPrior:
     # As in VGGT's preprocessing: the longer side to 518, the other to a multiple of 14, the rest of a square padded.
     inner = [_SIDE if n == long else round(n * (_SIDE / long) / _PATCH) * _PATCH for n in (height, width)]
     top, left = (h - inner[0]) // 2, (w - inner[1]) // 2
-    back = lambda x: resize(x[top:top + inner[0], left:left + inner[1]], height, width)
+    back = lambda x: resize(x[top : top + inner[0], left : left + inner[1]], height, width)
     values = outlined(back(depth), view)
     return DepthPrior(values, False, np.where(np.isfinite(values), back(confidence), np.float32(0)))
 
@@ -121,6 +124,7 @@ def _scale(pairs) -> np.float32:
 
 # ---- The network ----
 
+
 class _Network:
     """VGGT with the parts that depth takes."""
 
@@ -140,8 +144,12 @@ class _Network:
                     raise ValueError(f"{len(missing)} weights are missing, the first is {missing[0]}")
         except Exception as error:  # whatever a hub, a network or a damaged file leads to
             reason = " ".join(str(error).split())[:200] or type(error).__name__
-            remedy = (f"check the network, or get model.pt from https://huggingface.co/{HUB} some other way and give its "
-                      "path as weights" if path is None else "download it again")
+            remedy = (
+                f"check the network, or get model.pt from https://huggingface.co/{HUB} some other way and give its "
+                "path as weights"
+                if path is None
+                else "download it again"
+            )
             raise UserError(f"VGGT's weights {path or weights} cannot be loaded ({reason}): {remedy}; {_OTHERS}") from error
         model.camera_head = model.point_head = model.track_head = None  # their memory
         self.torch, self.load = torch, load_and_preprocess_images
@@ -175,8 +183,10 @@ def _local(weights) -> Path | None:
         return path
     if re.fullmatch(r"[\w.-]+/[\w.-]+", str(weights)) and path.suffix not in (".pt", ".safetensors"):
         return None
-    raise UserError(f"VGGT's weights {path} do not exist: give a model.pt or model.safetensors, or a name on the hub such "
-                    f"as {HUB}; {_OTHERS}")
+    raise UserError(
+        f"VGGT's weights {path} do not exist: give a model.pt or model.safetensors, or a name on the hub such "
+        f"as {HUB}; {_OTHERS}"
+    )
 
 
 def _state(path):

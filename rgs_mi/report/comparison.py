@@ -24,6 +24,7 @@ _INK = (60, 60, 60)
 
 # ---- Means ----
 
+
 def means(rows, variants) -> dict[str, dict]:
     """For each variant its `FIGURES`, the means over seeds, then over scenes; how many ``scenes``; ``difference``: of the
     `SCORES` to the variant ``against``, over the scenes and seeds that both have, beside it ``difference_by_seed``."""
@@ -32,13 +33,20 @@ def means(rows, variants) -> dict[str, dict]:
     for variant in dict.fromkeys(r["variant"] for r in rows):
         against = variants[variant].against
         mine = {key[1:]: r for key, r in runs.items() if key[0] == variant}
-        pairs = {key: {n: r[n] - other[n] for n in SCORES if r[n] is not None and other[n] is not None}
-                 for key, r in mine.items() if variant != against and (other := runs.get((against, *key)))}
+        pairs = {
+            key: {n: r[n] - other[n] for n in SCORES if r[n] is not None and other[n] is not None}
+            for key, r in mine.items()
+            if variant != against and (other := runs.get((against, *key)))
+        }
         seeds = sorted({seed for _, seed in pairs})
         of_seed = {seed: {key: d for key, d in pairs.items() if key[1] == seed} for seed in seeds}
         table[variant] = {
-            "scenes": len({scene for scene, _ in mine}), **mean(mine, FIGURES), "against": against,
-            "difference": mean(pairs, SCORES), "difference_by_seed": {s: mean(of_seed[s], SCORES) for s in seeds}}
+            "scenes": len({scene for scene, _ in mine}),
+            **mean(mine, FIGURES),
+            "against": against,
+            "difference": mean(pairs, SCORES),
+            "difference_by_seed": {s: mean(of_seed[s], SCORES) for s in seeds},
+        }
     return table
 
 
@@ -56,8 +64,16 @@ def mean(figures, names) -> dict:
 
 # ---- Tables ----
 
-_PLAIN = {"psnr": "{:.2f}", "ssim": "{:.4f}", "lpips": "{:.4f}", "normal_mae_deg": "{:.2f}°", "surfels": "{:,.0f}",
-          "render_fps": "{:.1f}", "train_seconds": "{:.1f}", "peak_rss_mb": "{:.0f}"}
+_PLAIN = {
+    "psnr": "{:.2f}",
+    "ssim": "{:.4f}",
+    "lpips": "{:.4f}",
+    "normal_mae_deg": "{:.2f}°",
+    "surfels": "{:,.0f}",
+    "render_fps": "{:.1f}",
+    "train_seconds": "{:.1f}",
+    "peak_rss_mb": "{:.0f}",
+}
 _SIGNED = {"psnr": "{:+.2f}", "ssim": "{:+.4f}", "lpips": "{:+.4f}", "normal_mae_deg": "{:+.2f}°"}
 
 
@@ -74,13 +90,29 @@ def mean_tables(table, variants, published) -> str:
     for against in dict.fromkeys(variants[name].against for name in table):
         names = [name for name in table if variants[name].against == against]
         beside = any(name in published for name in names)
-        lines = [(f"Δ: to {variants[against].label}", "scenes", *_HEADER, "Δ PSNR", "Δ SSIM", "Δ LPIPS", "Δ normals",
-                  *(("paper: PSNR", "Δ", "SSIM", "normals", "surfels") if beside else ()))]
+        lines = [
+            (
+                f"Δ: to {variants[against].label}",
+                "scenes",
+                *_HEADER,
+                "Δ PSNR",
+                "Δ SSIM",
+                "Δ LPIPS",
+                "Δ normals",
+                *(("paper: PSNR", "Δ", "SSIM", "normals", "surfels") if beside else ()),
+            )
+        ]
         for name in names:
             row = table[name]
-            lines.append((variants[name].label, str(row["scenes"]), *(_cell(n, row[n]) for n in FIGURES),
-                          *(_difference(row, n) for n in SCORES),
-                          *(_published(published, name, against) if beside else ())))
+            lines.append(
+                (
+                    variants[name].label,
+                    str(row["scenes"]),
+                    *(_cell(n, row[n]) for n in FIGURES),
+                    *(_difference(row, n) for n in SCORES),
+                    *(_published(published, name, against) if beside else ()),
+                )
+            )
         texts.append(text_table(lines))
     return "\n\n".join(texts)
 
@@ -95,8 +127,13 @@ def _difference(row, name):
 def _published(published, variant, against):
     figures, other = published.get(variant, {}), published.get(against, {})
     gain = figures["psnr"] - other["psnr"] if figures and other and variant != against else None
-    return [_cell("psnr", figures.get("psnr")), _cell("psnr", gain, _SIGNED), f"{figures['ssim']:.3f}" if figures else "",
-            _cell("normal_mae_deg", figures.get("normal_mae_deg")), _cell("surfels", figures.get("surfels"))]
+    return [
+        _cell("psnr", figures.get("psnr")),
+        _cell("psnr", gain, _SIGNED),
+        f"{figures['ssim']:.3f}" if figures else "",
+        _cell("normal_mae_deg", figures.get("normal_mae_deg")),
+        _cell("surfels", figures.get("surfels")),
+    ]
 
 
 def scene_table(rows) -> str:
@@ -104,8 +141,15 @@ def scene_table(rows) -> str:
     lines = [("", "seed", *_HEADER, "MB", "")]
     for name, r in rows:
         note = "" if r["status"] == "finished" else r["error"] or "not yet"
-        lines.append((name, str(r["seed"]), *(_cell(n, r[n]) for n in FIGURES), _cell("peak_rss_mb", r["peak_rss_mb"]),
-                      note.replace("|", "\\|")))
+        lines.append(
+            (
+                name,
+                str(r["seed"]),
+                *(_cell(n, r[n]) for n in FIGURES),
+                _cell("peak_rss_mb", r["peak_rss_mb"]),
+                note.replace("|", "\\|"),
+            )
+        )
     return text_table(lines)
 
 
@@ -119,6 +163,7 @@ def text_table(lines) -> str:
 
 # ---- Pictures ----
 
+
 def picture(path, views, columns, background):
     """Write a picture of a scene: for each of ``views`` a row of images and one of normals. Columns: the truth, then
     ``columns``, [(label, figures of metrics.json, the run's folder)]; ``background``: as it was fitted with."""
@@ -126,8 +171,9 @@ def picture(path, views, columns, background):
     rows = [row for view in views for row in _rows(view, [folder / "test" for _, _, folder in columns], background)]
     heights = [round(_PANEL * row[-1].shape[0] / row[-1].shape[1]) for row in rows]
     top, step = _MARGIN + 3 * _TEXT, _PANEL + _GAP
-    sheet = Image.new("RGB", (2 * _MARGIN + len(labels) * step - _GAP, top + sum(heights) + len(rows) * _GAP + _MARGIN),
-                      "white")
+    sheet = Image.new(
+        "RGB", (2 * _MARGIN + len(labels) * step - _GAP, top + sum(heights) + len(rows) * _GAP + _MARGIN), "white"
+    )
     draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(_TEXT)
     for k, words in enumerate(labels):
         x, y = _MARGIN + k * step, top

@@ -6,11 +6,17 @@ from .html import Html
 
 #: name in metrics.json -> label, words of a value, unit
 FIGURES = {
-    "psnr": ("PSNR", "{:.2f}", " dB"), "ssim": ("SSIM", "{:.4f}", ""), "lpips": ("LPIPS (VGG)", "{:.4f}", ""),
-    "lpips_alex": ("LPIPS (AlexNet)", "{:.4f}", ""), "normal_mae_deg": ("normal error", "{:.2f}", "°"),
-    "normal_ssim": ("SSIM of normals", "{:.4f}", ""), "normal_lpips": ("LPIPS of normals", "{:.4f}", ""),
-    "surfels": ("surfels", "{:,.0f}", ""), "render_fps": ("views/s", "{:.1f}", ""),
-    "train_seconds": ("time", "{}", ""), "iterations": ("steps", "{:,.0f}", ""),
+    "psnr": ("PSNR", "{:.2f}", " dB"),
+    "ssim": ("SSIM", "{:.4f}", ""),
+    "lpips": ("LPIPS (VGG)", "{:.4f}", ""),
+    "lpips_alex": ("LPIPS (AlexNet)", "{:.4f}", ""),
+    "normal_mae_deg": ("normal error", "{:.2f}", "°"),
+    "normal_ssim": ("SSIM of normals", "{:.4f}", ""),
+    "normal_lpips": ("LPIPS of normals", "{:.4f}", ""),
+    "surfels": ("surfels", "{:,.0f}", ""),
+    "render_fps": ("views/s", "{:.1f}", ""),
+    "train_seconds": ("time", "{}", ""),
+    "iterations": ("steps", "{:,.0f}", ""),
     "peak_rss_mb": ("memory", "{:,.0f}", " MB"),
 }
 

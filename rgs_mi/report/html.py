@@ -28,9 +28,11 @@ class Html(str):
 def page(title: str, *parts: str) -> str:
     """An HTML document of ``parts``, HTML each."""
     style, script = (resources.files(__package__).joinpath(name).read_text("utf-8") for name in ("page.css", "page.js"))
-    return (f"<!doctype html><html lang='en'><head><meta charset='utf-8'><meta name='viewport' content='width=device-width'>"
-            f"<title>{escape(title)}</title><link rel='icon' href='data:,'><style>{style}</style></head>"
-            f"<body><h1>{escape(title)}</h1>{''.join(parts)}<script type='module'>{script}</script></body></html>\n")
+    return (
+        f"<!doctype html><html lang='en'><head><meta charset='utf-8'><meta name='viewport' content='width=device-width'>"
+        f"<title>{escape(title)}</title><link rel='icon' href='data:,'><style>{style}</style></head>"
+        f"<body><h1>{escape(title)}</h1>{''.join(parts)}<script type='module'>{script}</script></body></html>\n"
+    )
 
 
 def heading(text: str, level: int = 2) -> str:
@@ -52,6 +54,7 @@ def group(kind: str, *parts: str) -> str:
 
 
 # ---- Figures ----
+
 
 def tiles(figures: dict) -> str:
     """``figures`` {label: value} that come first."""
@@ -78,10 +81,13 @@ def _text(value):
 
 # ---- Pictures ----
 
+
 def figure(image: np.ndarray, caption: str, zoom: int = 1) -> str:
     """``image`` [H, W, 3], display values in [0, 1], each pixel shown ``zoom`` wide, and stored without loss."""
-    return (f"<figure><img alt='{escape(caption, quote=True)}' width='{zoom * image.shape[1]}' style='image-rendering: "
-            f"pixelated' src='{_png(image)}'><figcaption>{escape(caption)}</figcaption></figure>")
+    return (
+        f"<figure><img alt='{escape(caption, quote=True)}' width='{zoom * image.shape[1]}' style='image-rendering: "
+        f"pixelated' src='{_png(image)}'><figcaption>{escape(caption)}</figcaption></figure>"
+    )
 
 
 def picture(image: np.ndarray, caption: str, alt: str, most: int, note: str = "") -> str:
@@ -102,18 +108,22 @@ def compare(left: np.ndarray, right: np.ndarray, names, alt: str, most: int) -> 
     """Two pictures [H, W, 3] of one size, called ``names``, on one another: a slider says how much is seen of which."""
     images = [thumbnail(image, f"{alt}: {name}", most) for image, name in zip((left, right), names)]
     label = escape(f"{names[0]} to the left, {names[1]} to the right of the line: {alt}", quote=True)
-    return (f"<figure><div class='compare'>{''.join(images)}<input type='range' min='0' max='100' step='0.5' value='50' "
-            f"aria-label='{label}'></div><figcaption class='sides'><span>{escape(names[0])}</span>"
-            f"<span>{escape(names[1])}</span></figcaption></figure>")
+    return (
+        f"<figure><div class='compare'>{''.join(images)}<input type='range' min='0' max='100' step='0.5' value='50' "
+        f"aria-label='{label}'></div><figcaption class='sides'><span>{escape(names[0])}</span>"
+        f"<span>{escape(names[1])}</span></figcaption></figure>"
+    )
 
 
 def exposure(radiance: np.ndarray, caption: str, stops: float = 8.0) -> str:
     """Linear ``radiance`` [H, W, 3] under a slider of its exposure, from −``stops`` to ``stops`` (EV)."""
     words = escape(caption, quote=True)
-    return (f"<figure class='exposure'><canvas width='{radiance.shape[1]}' height='{radiance.shape[0]}' role='img' "
-            f"aria-label='{words}'></canvas><img hidden alt='' src='{_png(rgbe(radiance))}'><label>exposure"
-            f"<input type='range' min='{-stops:g}' max='{stops:g}' step='0.1' value='0'><output></output></label>"
-            f"<figcaption>{words}</figcaption></figure>")
+    return (
+        f"<figure class='exposure'><canvas width='{radiance.shape[1]}' height='{radiance.shape[0]}' role='img' "
+        f"aria-label='{words}'></canvas><img hidden alt='' src='{_png(rgbe(radiance))}'><label>exposure"
+        f"<input type='range' min='{-stops:g}' max='{stops:g}' step='0.1' value='0'><output></output></label>"
+        f"<figcaption>{words}</figcaption></figure>"
+    )
 
 
 def rgbe(radiance: np.ndarray) -> np.ndarray:
@@ -148,8 +158,16 @@ def _jpeg(image, most):
 
 # ---- Curves ----
 
-def curves(series: dict, x_label: str, y_label: str, lines: dict | None = None, marks: dict | None = None,
-           low: float | None = 0.0, log: bool = False) -> str:
+
+def curves(
+    series: dict,
+    x_label: str,
+    y_label: str,
+    lines: dict | None = None,
+    marks: dict | None = None,
+    low: float | None = 0.0,
+    log: bool = False,
+) -> str:
     """A plot of ``series`` {name: (x, y)} as SVG, with horizontal ``lines`` {name: y} and vertical ``marks`` {name: x}.
 
     x from zero; y from ``low`` (None: from the least), or in decades where ``log``. What is not finite, or has no logarithm,
@@ -167,24 +185,35 @@ def curves(series: dict, x_label: str, y_label: str, lines: dict | None = None, 
     at = lambda x, y: (_LEFT + (right - _LEFT) * x / most_x, bottom - (bottom - _TOP) * (y - least) / span)
     parts = []
     for y, words in _decades(least, least + span) if log else _ticks(least, least + span):
-        parts += [f"<path d='M{_LEFT} {at(0, y)[1]:.1f}H{right}' style='stroke: var(--line)'/>",
-                  _words(_LEFT - 6, at(0, y)[1] + 4, words, "end")]
+        parts += [
+            f"<path d='M{_LEFT} {at(0, y)[1]:.1f}H{right}' style='stroke: var(--line)'/>",
+            _words(_LEFT - 6, at(0, y)[1] + 4, words, "end"),
+        ]
     parts += [_words(at(x, 0)[0], bottom + 16, words, "middle") for x, words in _ticks(0, most_x)]
-    parts += [f"<path d='M{_LEFT} {bottom}H{right}' style='stroke: var(--soft)'/>",
-              _words((_LEFT + right) / 2, _HEIGHT - 4, x_label, "middle"), _words(4, 12, y_label, "start")]
+    parts += [
+        f"<path d='M{_LEFT} {bottom}H{right}' style='stroke: var(--soft)'/>",
+        _words((_LEFT + right) / 2, _HEIGHT - 4, x_label, "middle"),
+        _words(4, 12, y_label, "start"),
+    ]
     for name, x in marks.items():
         left = at(x, 0)[0]
-        parts += [f"<path d='M{left:.1f} {_TOP - 14}V{bottom}' style='stroke: var(--soft)' stroke-dasharray='2 4'/>",
-                  _words(left + 4, _TOP - 5, name, "start")]
+        parts += [
+            f"<path d='M{left:.1f} {_TOP - 14}V{bottom}' style='stroke: var(--soft)' stroke-dasharray='2 4'/>",
+            _words(left + 4, _TOP - 5, name, "start"),
+        ]
     for name, y in lines.items():
         height = at(0, value(y))[1]
-        parts += [f"<path d='M{_LEFT} {height:.1f}H{right}' style='stroke: var(--bound)' stroke-dasharray='5 4'/>",
-                  _words(_LEFT + 6, height - 5, name, "start", "var(--bound)")]
+        parts += [
+            f"<path d='M{_LEFT} {height:.1f}H{right}' style='stroke: var(--bound)' stroke-dasharray='5 4'/>",
+            _words(_LEFT + 6, height - 5, name, "start", "var(--bound)"),
+        ]
     for k, (name, points) in enumerate(drawn.items()):
         ink = f"var(--ink-{k % _INKS})"
         coordinates = " ".join("{:.1f},{:.1f}".format(*at(x, y)) for x, y in points)
-        parts.append(f"<polyline points='{coordinates}' fill='none' stroke-linejoin='round' stroke-width='1.6' "
-                     f"style='stroke: {ink}'/>")
+        parts.append(
+            f"<polyline points='{coordinates}' fill='none' stroke-linejoin='round' stroke-width='1.6' "
+            f"style='stroke: {ink}'/>"
+        )
         if legend:
             parts.append(_words(right + 8, _TOP + 10 + 16 * k, name, "start", ink))
     words = escape(f"{y_label} over {x_label}", quote=True)
@@ -210,7 +239,7 @@ def _decades(low, high):
     steps = (1, 2, 5) if high - low < 2 else (1,)
     found = [(p + math.log10(k), _number(k * 10.0**p)) for p in range(math.floor(low), math.ceil(high) + 1) for k in steps]
     found = [tick for tick in found if low - 1e-9 <= tick[0] <= high]
-    return found[::max(1, math.ceil(len(found) / 6))]
+    return found[:: max(1, math.ceil(len(found) / 6))]
 
 
 def _number(value):

@@ -42,25 +42,42 @@ PAPER = {
         "RGS, the paper": ((31.24, 0.965, 0.043), (35.38, 0.976, 0.050), (24.31, 0.670, 0.257)),
     },
     "NeRF Synthetic": {
-        "NeRF": ((31.01, 0.947, 0.081),), "VolSDF": ((27.96, 0.932, 0.096),), "Ref-NeRF": ((31.29, 0.947, 0.058),),
-        "ENVIDR": ((28.13, 0.956, 0.067),), "3DGS": ((33.30, 0.969, 0.030),),
-        "GaussianShader": ((31.46, 0.960, 0.042),), "RGS, the paper": ((33.51, 0.968, 0.028),),
+        "NeRF": ((31.01, 0.947, 0.081),),
+        "VolSDF": ((27.96, 0.932, 0.096),),
+        "Ref-NeRF": ((31.29, 0.947, 0.058),),
+        "ENVIDR": ((28.13, 0.956, 0.067),),
+        "3DGS": ((33.30, 0.969, 0.030),),
+        "GaussianShader": ((31.46, 0.960, 0.042),),
+        "RGS, the paper": ((33.51, 0.968, 0.028),),
     },
     "Normals": {
-        "ENVIDR": ((2.74, 0.948, 0.072),), "Ref-Gaussian": ((2.18, 0.952, 0.053),), "3DGS-DR": ((2.62, 0.947, 0.065),),
-        "EnvGS": ((2.66, 0.945, 0.062),), "RGS, the paper": ((2.04, 0.954, 0.051),),
+        "ENVIDR": ((2.74, 0.948, 0.072),),
+        "Ref-Gaussian": ((2.18, 0.952, 0.053),),
+        "3DGS-DR": ((2.62, 0.947, 0.065),),
+        "EnvGS": ((2.66, 0.945, 0.062),),
+        "RGS, the paper": ((2.04, 0.954, 0.051),),
     },
     "Budget": {
-        "3DGS": ((3.3e6, 0.6 * 3600, 604, None, 30.35),), "3DGS-DR": ((1.1e6, 2 * 3600, 71, None, 34.08),),
-        "EnvGS": ((2.9e6, 3 * 3600, 21, None, 33.82),), "RGS, the paper": ((0.1e6, 3 * 3600, 146, None, 35.38),),
+        "3DGS": ((3.3e6, 0.6 * 3600, 604, None, 30.35),),
+        "3DGS-DR": ((1.1e6, 2 * 3600, 71, None, 34.08),),
+        "EnvGS": ((2.9e6, 3 * 3600, 21, None, 33.82),),
+        "RGS, the paper": ((0.1e6, 3 * 3600, 146, None, 35.38),),
     },
 }
 
 # As the paper writes them: figure -> words, number
-_STYLE = {"psnr": ("PSNR", "{:.2f}"), "ssim": ("SSIM", "{:.3f}"), "lpips": ("LPIPS", "{:.3f}"),
-          "normal_mae_deg": ("error of normals", "{:.2f}°"), "normal_ssim": ("SSIM", "{:.3f}"),
-          "normal_lpips": ("LPIPS", "{:.3f}"), "surfels": ("surfels", "{:,.0f}"), "render_fps": ("views/s", "{:.0f}"),
-          "train_seconds": ("min", "{:.0f}"), "peak_rss_mb": ("MB", "{:.0f}")}
+_STYLE = {
+    "psnr": ("PSNR", "{:.2f}"),
+    "ssim": ("SSIM", "{:.3f}"),
+    "lpips": ("LPIPS", "{:.3f}"),
+    "normal_mae_deg": ("error of normals", "{:.2f}°"),
+    "normal_ssim": ("SSIM", "{:.3f}"),
+    "normal_lpips": ("LPIPS", "{:.3f}"),
+    "surfels": ("surfels", "{:,.0f}"),
+    "render_fps": ("views/s", "{:.0f}"),
+    "train_seconds": ("min", "{:.0f}"),
+    "peak_rss_mb": ("MB", "{:.0f}"),
+}
 
 
 def by_data_set(names) -> dict[str, list[str]]:
@@ -81,8 +98,11 @@ def means(rows, names) -> dict[str, dict]:
     for data_set, scenes in by_data_set(names).items():
         mine = {(r["scene"], r["seed"]): r for r in rows if r["scene"] in scenes and r["status"] == "finished"}
         if mine:
-            table[data_set] = {"scenes": len({scene for scene, _ in mine}), "of": len(SCENES[data_set]),
-                               **mean(mine, (*FIGURES, *DETAILS))}
+            table[data_set] = {
+                "scenes": len({scene for scene, _ in mine}),
+                "of": len(SCENES[data_set]),
+                **mean(mine, (*FIGURES, *DETAILS)),
+            }
     return table
 
 
@@ -98,8 +118,9 @@ def tables(ours: dict[str, dict]) -> list[str]:
         for method, numbers in PAPER[title].items():
             lines.append((method, *(_cell(name, n) for k in shown for name, n in zip(figures, numbers[k]))))
         counts = ", ".join(f"{ours[data_sets[k]]['scenes']} of {ours[data_sets[k]]['of']}" for k in shown)
-        lines.append((f"this run, scenes {counts}",
-                      *(_cell(name, ours[data_sets[k]][name]) for k in shown for name in figures)))
+        lines.append(
+            (f"this run, scenes {counts}", *(_cell(name, ours[data_sets[k]][name]) for k in shown for name in figures))
+        )
         heading = title if len(data_sets) > 1 or title == data_sets[0] else f"{title}, {data_sets[0]}"
         sections += [f"## {heading}", text_table(lines)]
     return sections

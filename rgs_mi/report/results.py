@@ -32,8 +32,9 @@ def write(fit, scene, folder, quiet):
     facts = _facts(fit)  # the peak of memory is the fit's, not of judging it
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
-        exported = export(folder, scene, surfels, environment, *fit.begun, fit.model.shader(),
-                          judged(fit.dataset), fit.settings.spp)
+        exported = export(
+            folder, scene, surfels, environment, *fit.begun, fit.model.shader(), judged(fit.dataset), fit.settings.spp
+        )
         lighting = fit.lighting(surfels)
     mean, scores, rows = measure(surfels, lighting, fit.dataset, fit.settings.background, fit.settings.spp, folder, quiet)
     if (guided := fit.guided_picture()) is not None:
@@ -61,8 +62,13 @@ def measure(surfels, lighting, dataset, background, spp, folder, quiet) -> tuple
     if not dataset.test:
         scores = {}
     mean = evaluate.mean_scores(list(scores.values()))
-    reason = None if mean["lpips"] is not None else \
-        "not measured: no test views that are large enough" if lpips.installed() else _NO_LPIPS
+    reason = (
+        None
+        if mean["lpips"] is not None
+        else "not measured: no test views that are large enough"
+        if lpips.installed()
+        else _NO_LPIPS
+    )
     fps = evaluate.frames_per_second(surfels, lighting, [view.camera for view in views], spp)
     return mean | {"lpips_reason": reason, "render_fps": fps}, scores, rows
 
@@ -75,8 +81,11 @@ def publish(folder, figures, curves, rows, environment, others=()):
     lines, texels = _summary(figures), environment.texels.numpy()
     pictures.contact_sheet(folder / SHEET, list(rows.values()), texels, folder.resolve().name, lines)
     report.write(folder, figures, curves, rows, texels)
-    print("\n".join([*lines, "", *map(str, (folder / report.REPORT, folder / SHEET, folder / METRICS, *others,
-                                           folder / "test"))]))
+    print(
+        "\n".join(
+            [*lines, "", *map(str, (folder / report.REPORT, folder / SHEET, folder / METRICS, *others, folder / "test"))]
+        )
+    )
 
 
 def judged(dataset) -> list:
@@ -100,22 +109,36 @@ def finished(folder) -> bool:
 def _facts(fit) -> dict:
     """What metrics.json says of the run as a whole, beside `measure`."""
     return {
-        "finished": fit.progress >= 1, "train_seconds": fit.elapsed, "iterations": fit.step_number,
-        "surfels": len(fit.model), "parameters": sum(fit.model.numpy(name).size for name in fit.model.optimizer.keys()),
+        "finished": fit.progress >= 1,
+        "train_seconds": fit.elapsed,
+        "iterations": fit.step_number,
+        "surfels": len(fit.model),
+        "parameters": sum(fit.model.numpy(name).size for name in fit.model.optimizer.keys()),
         "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "train_views": len(fit.dataset.train), "test_views": len(fit.dataset.test),
-        "photographs": str(fit.dataset.root.resolve()), "settings": to_dict(fit.settings), **circumstances(),
+        "train_views": len(fit.dataset.train),
+        "test_views": len(fit.dataset.test),
+        "photographs": str(fit.dataset.root.resolve()),
+        "settings": to_dict(fit.settings),
+        **circumstances(),
     }
 
 
 def circumstances() -> dict:
     """With what, where and by which command this process runs, as metrics.json has it."""
     return {
-        "versions": {"rgs_mi": __version__, "mitsuba": mi.__version__, "drjit": dr.__version__,
-                     "python": platform.python_version()},
-        "machine": {"cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-                    "threads": dr.thread_count(), "processor": platform.machine(), "system": platform.system(),
-                    "variant": mi.variant()},
+        "versions": {
+            "rgs_mi": __version__,
+            "mitsuba": mi.__version__,
+            "drjit": dr.__version__,
+            "python": platform.python_version(),
+        },
+        "machine": {
+            "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+            "threads": dr.thread_count(),
+            "processor": platform.machine(),
+            "system": platform.system(),
+            "variant": mi.variant(),
+        },
         "command": shlex.join(sys.argv),
     }
 
@@ -132,6 +155,9 @@ def _summary(figures) -> list[str]:
         quality.append(f"LPIPS {figures['lpips']:.4f}")
     if figures["normal_mae_deg"] is not None:
         quality.append(f"normal error {figures['normal_mae_deg']:.2f}°")
-    return [*quality, f"{figures['surfels']:,} surfels".replace(",", " "),
-            f"{figures['iterations']} steps in {minutes}:{seconds:02} min",
-            f"{figures['render_fps']:.1f} views per second"]
+    return [
+        *quality,
+        f"{figures['surfels']:,} surfels".replace(",", " "),
+        f"{figures['iterations']} steps in {minutes}:{seconds:02} min",
+        f"{figures['render_fps']:.1f} views per second",
+    ]

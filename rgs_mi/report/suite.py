@@ -30,14 +30,24 @@ def write_suite(path, runs, title: str):
     names = [name for name in FIGURES if any(figures.get(name) is not None for _, _, figures, _ in found)]
     rows, bad, done = [], [], []
     for k, (scene, folder, figures, error) in enumerate(found):
-        rows.append([_scene(path, scene, folder, error), html.Html("".join(_thumbnails(folder, scene))),
-                     *(cell(name, figures.get(name), f"{scene}/{name}") for name in names)])
+        rows.append(
+            [
+                _scene(path, scene, folder, error),
+                html.Html("".join(_thumbnails(folder, scene))),
+                *(cell(name, figures.get(name), f"{scene}/{name}") for name in names),
+            ]
+        )
         (bad.append(k) if error else done.append(figures))
     mean = ["mean", f"{len(done)} of {len(found)}", *(_mean(name, done) for name in names)]
     words = f"{len(done)} of {len(found)} scenes came to an end; figures of quality are of views that were held out."
     with atomic_file(path) as stream:
-        stream.write(html.page(title, html.paragraph(words, "soft"),
-                               html.table(["scene", "photograph, rendering", *map(label, names)], rows, bad, mean)).encode())
+        stream.write(
+            html.page(
+                title,
+                html.paragraph(words, "soft"),
+                html.table(["scene", "photograph, rendering", *map(label, names)], rows, bad, mean),
+            ).encode()
+        )
 
 
 def _figures(folder, error):
@@ -56,8 +66,11 @@ def _figures(folder, error):
 def _scene(path, scene, folder, error):
     """The name, a link where the run has a page, and below it what went wrong."""
     report = folder and folder / REPORT
-    words = html.link(scene, Path(os.path.relpath(report, path.parent)).as_posix()) if report and report.exists() else \
-        escape(scene)
+    words = (
+        html.link(scene, Path(os.path.relpath(report, path.parent)).as_posix())
+        if report and report.exists()
+        else escape(scene)
+    )
     return html.Html(words + (f"<small>{escape(error)}</small>" if error else ""))
 
 
@@ -76,4 +89,4 @@ def _thumbnails(folder, scene):
             continue  # what is missing in a row is seen
         width = max(pixels.shape[1] // 3, 1)
         for k, kind in enumerate(("photograph", "rendering")):
-            yield html.thumbnail(pixels[:, k * width:(k + 1) * width, :3], f"{kind} of {scene}", _STORED, _SHOWN)
+            yield html.thumbnail(pixels[:, k * width : (k + 1) * width, :3], f"{kind} of {scene}", _STORED, _SHOWN)

@@ -58,6 +58,7 @@ def to_dict(config) -> dict:
 def completed(cls, tree: dict) -> dict:
     """What `to_dict` once gave for a ``cls``, and JSON kept, as it would be now: settings that came later have their
     defaults, those that are gone are left out."""
+
     def fill(tree, defaults):
         return {k: fill(tree.get(k, {}), v) if isinstance(v, dict) and v else tree.get(k, v) for k, v in defaults.items()}
 
@@ -71,6 +72,7 @@ def presets() -> list[str]:
 
 # ---- Sources ----
 
+
 def _preset_folder():
     return resources.files(__package__) / "presets"
 
@@ -83,8 +85,9 @@ def _read(source):
     elif name in presets():
         path = _preset_folder() / f"{name}.yaml"
     else:
-        raise UserError(f"no preset '{name}': choose one of {', '.join(presets()) or '(none)'}, "
-                        "or give a file as FOLDER/NAME.yaml")
+        raise UserError(
+            f"no preset '{name}': choose one of {', '.join(presets()) or '(none)'}, or give a file as FOLDER/NAME.yaml"
+        )
     try:
         return path.read_text(encoding="utf-8"), name
     except OSError as error:
@@ -131,6 +134,7 @@ def _parse(text, label):
 
 
 # ---- Checking ----
+
 
 class _Reader:
     """Checks the values of one source; ``label`` names it in messages, ``root`` is where suggestions come from."""
@@ -219,8 +223,13 @@ class _Reader:
         elif type(value) in (int, float):
             low, high = metadata.get("min", -math.inf), metadata.get("max", math.inf)
             if not low <= value <= high:
-                allowed = f"at least {low}" if high == math.inf else f"at most {high}" if low == -math.inf \
+                allowed = (
+                    f"at least {low}"
+                    if high == math.inf
+                    else f"at most {high}"
+                    if low == -math.inf
                     else f"between {low} and {high}"
+                )
                 raise UserError(f"{self.label}: '{key}' is {value}: it must be {allowed}")
 
     def _wrong_type(self, key, expected, value):

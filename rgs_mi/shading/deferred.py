@@ -57,6 +57,7 @@ class Lighting:
 
     def _cover(self, normal, point, roughness):
         """What an estimator asks what comes along a direction; None: the environment's radiance does."""
+
         def cover(light, direction, lane):
             at = lambda v: v if lane is None else dr.gather(type(v), v, lane)
             part = 1 if self.lit else dr.clip((_WIDE - at(roughness)) / (_WIDE - _NARROW), 0, 1)
@@ -90,8 +91,12 @@ class Lighting:
 
     def with_learned(self, arrays, surfels) -> "Lighting":
         """The same with other ``arrays`` in place of `learned`, and for other ``surfels``, moved ones."""
-        return replace(self, estimator=self.estimator.with_texels(arrays[0]), shader=self.shader and Shader(arrays[1]),
-                       indirect=self.indirect and replace(self.indirect, surfels=surfels))
+        return replace(
+            self,
+            estimator=self.estimator.with_texels(arrays[0]),
+            shader=self.shader and Shader(arrays[1]),
+            indirect=self.indirect and replace(self.indirect, surfels=surfels),
+        )
 
 
 @dataclass

@@ -19,8 +19,8 @@ from . import prefilter as _prefilter
 class Environment:
     """A learned or loaded environment.
 
-      texels:   ``mi.TensorXf`` [rows, columns, 3], linear radiance (scale included), without the emitter's halo columns
-      rotation: [3, 3] emitter frame to world frame
+    texels:   ``mi.TensorXf`` [rows, columns, 3], linear radiance (scale included), without the emitter's halo columns
+    rotation: [3, 3] emitter frame to world frame
     """
 
     texels: "mi.TensorXf"
@@ -42,8 +42,7 @@ class Environment:
             radiance = mi.Color3f(params["radiance.value"])
             return cls(dr.zeros(mi.TensorXf, (8, 16, 3)) + mi.TensorXf(dr.ravel(radiance), (1, 1, 3)), np.eye(3))
         if emitter.class_name() != "EnvironmentMapEmitter":
-            raise UserError(f"emitter '{emitter.id()}' is a {emitter.class_name()}: "
-                            "surfels need an 'envmap' or 'constant'")
+            raise UserError(f"emitter '{emitter.id()}' is a {emitter.class_name()}: surfels need an 'envmap' or 'constant'")
         texels = params["data"][:, 1:-1, :] * params["scale"]
         rotation = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)[:3, :3]
         return cls(texels, rotation)
@@ -75,8 +74,11 @@ class Environment:
         """Mitsuba's own `envmap` of the same radiance, for its sampling."""
         to_world = np.eye(4)
         to_world[:3, :3] = self.rotation
-        emitter = {"type": "envmap", "bitmap": mi.Bitmap(dr.detach(self.texels).numpy()),
-                   "to_world": mi.ScalarTransform4f(to_world)}
+        emitter = {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(dr.detach(self.texels).numpy()),
+            "to_world": mi.ScalarTransform4f(to_world),
+        }
         return mi.load_dict({"type": "scene", "emitter": emitter}).environment()
 
 
@@ -129,8 +131,11 @@ class FilteredEnvironment:
         for low, high in zip(nodes[:-1], nodes[1:]):
             position += dr.clip((roughness - low) / (high - low), 0, 1)
         level = dr.minimum(mi.UInt32(dr.detach(position)), len(nodes) - 2)
-        return dr.lerp(self._level(longitude, colatitude, level), self._level(longitude, colatitude, level + 1),
-                       position - mi.Float(level))
+        return dr.lerp(
+            self._level(longitude, colatitude, level),
+            self._level(longitude, colatitude, level + 1),
+            position - mi.Float(level),
+        )
 
     def eval_diffuse(self, normal):
         """Radiance averaged over the cosine lobe around world-space unit ``normal``: irradiance by π."""

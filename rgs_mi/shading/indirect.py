@@ -92,8 +92,13 @@ class Indirect:
         if met.two_sided:
             normal = dr.mulsign(normal, -dr.dot(direction, normal))
         lighting = lighting.seen_again()
-        surface = (normal, -direction, met.column(mi.Float, "roughness"), met.column(mi.Float, "metallic"),
-                   met.column(mi.Color3f, "base_color"))
+        surface = (
+            normal,
+            -direction,
+            met.column(mi.Float, "roughness"),
+            met.column(mi.Float, "metallic"),
+            met.column(mi.Color3f, "base_color"),
+        )
         specular = lighting.specular(*surface)
         if not lighting.lit:
             return met.radiance(direction) + specular

@@ -107,8 +107,9 @@ def _materials(eta: float, variant: str):
     """Principled BSDFs that are black (a dielectric), metallic, and plastic, and the textures of the latter two: their
     roughness, a lane each, and their base colour."""
     roughness, color = mi.load_dict({"type": "lanes"}), mi.load_dict({"type": "lanes", "channels": 3})
-    bsdf = lambda metallic, base_color: mi.load_dict({"type": "principled", "eta": eta, "metallic": metallic,
-                                                      "base_color": base_color, "roughness": roughness})
+    bsdf = lambda metallic, base_color: mi.load_dict(
+        {"type": "principled", "eta": eta, "metallic": metallic, "base_color": base_color, "roughness": roughness}
+    )
     return bsdf(0.0, {"type": "rgb", "value": 0.0}), bsdf(1.0, color), bsdf(0.0, color), roughness, color
 
 
@@ -176,8 +177,11 @@ class WholeLobe(_Lobe):
         of_metal = choice < self.metallic
         choice = dr.select(of_metal, choice / self.metallic, (choice - self.metallic) / (1 - self.metallic))
         with self.plugins() as (_, metal, plastic):
-            return dr.select(of_metal, metal.sample(self.context, si, choice, point)[0].wo,
-                             plastic.sample(self.context, si, choice, point)[0].wo)
+            return dr.select(
+                of_metal,
+                metal.sample(self.context, si, choice, point)[0].wo,
+                plastic.sample(self.context, si, choice, point)[0].wo,
+            )
 
 
 def _spread(surfaces, count):

@@ -106,7 +106,7 @@ class Prefilter:
         spectrum = np.zeros((columns // 2 + 1, rows, 3), np.complex64)
         for (r, c), matrix, offset in zip(self.maps[1:], self.matrices, self.offsets[1:]):
             m = matrix.shape[0]
-            level = adjoint[offset:offset + r * c].reshape(r, c, 3).transpose(1, 0, 2)
+            level = adjoint[offset : offset + r * c].reshape(r, c, 3).transpose(1, 0, 2)
             level = fft.rfft(level, axis=0)[:m] * self._phase(m, c).conj()[:, None, None]
             if c % 2 == 0 and m == c // 2 + 1 and c < columns:
                 level[-1] *= 0.5  # irfft reads the highest frequency of a short map once, of a long one twice

@@ -52,7 +52,7 @@ class Shader:
         layers, first = [], 0
         for rows, columns in SHAPES:
             layer = nn.Linear(columns, rows, bias=False)
-            layer.weights = dr.reshape(self.weights[first:first + rows * columns], (rows, columns))
+            layer.weights = dr.reshape(self.weights[first : first + rows * columns], (rows, columns))
             layers += [layer, nn.LeakyReLU()]
             first += rows * columns
         return nn.Sequential(*layers[:-1], nn.Tanh())
@@ -81,8 +81,10 @@ class Shader:
             raise UserError(f"{path}: is no shader, or damaged: {_REMEDY}") from error
         for name, shape in _arrays().items():
             if arrays[name].shape != shape or arrays[name].dtype.kind != "f":
-                raise UserError(f"{path}: '{name}' is {arrays[name].dtype} of shape {arrays[name].shape}, "
-                                f"needs floats of shape {shape}: {_REMEDY}")
+                raise UserError(
+                    f"{path}: '{name}' is {arrays[name].dtype} of shape {arrays[name].shape}, "
+                    f"needs floats of shape {shape}: {_REMEDY}"
+                )
             if not np.isfinite(arrays[name]).all():
                 raise UserError(f"{path}: '{name}' is not finite: {_REMEDY}")
         return cls(mi.TensorXf(np.concatenate([array.ravel() for array in arrays.values()]).astype(np.float32)))

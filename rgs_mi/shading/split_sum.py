@@ -78,6 +78,11 @@ def _table(cosine, roughness, columns, eta):
     values = []
     for k in columns:
         fetch = lambda i: dr.gather(mi.Float, entries, i + k * plane)
-        values.append(dr.lerp(dr.lerp(fetch(index), fetch(index + 1), fx),
-                              dr.lerp(fetch(index + tables.ROUGHNESSES), fetch(index + tables.ROUGHNESSES + 1), fx), fy))
+        values.append(
+            dr.lerp(
+                dr.lerp(fetch(index), fetch(index + 1), fx),
+                dr.lerp(fetch(index + tables.ROUGHNESSES), fetch(index + tables.ROUGHNESSES + 1), fx),
+                fy,
+            )
+        )
     return values

@@ -44,8 +44,15 @@ def cell(cosine, roughness, rows, columns):
 
 def principled(roughness: float, metallic: float, base_color: float, eta: float):
     """A stock principled BSDF with constant parameters."""
-    return mi.load_dict({"type": "principled", "roughness": max(roughness, MIN_ROUGHNESS), "metallic": metallic, "eta": eta,
-                         "base_color": {"type": "rgb", "value": [base_color] * 3}})
+    return mi.load_dict(
+        {
+            "type": "principled",
+            "roughness": max(roughness, MIN_ROUGHNESS),
+            "metallic": metallic,
+            "eta": eta,
+            "base_color": {"type": "rgb", "value": [base_color] * 3},
+        }
+    )
 
 
 def interaction(wi):
@@ -64,8 +71,10 @@ def albedo_table(eta: float, variant: str) -> np.ndarray:
     n = _SIDE * _SIDE
     k = dr.arange(mi.UInt32, len(mu) * n)
     jitter = mi.PCG32(size=len(mu) * n)
-    sample = mi.Point2f(mi.Float(k % _SIDE) + jitter.next_float32(),
-                        mi.Float((k // _SIDE) % _SIDE) + jitter.next_float32()) / _SIDE
+    sample = (
+        mi.Point2f(mi.Float(k % _SIDE) + jitter.next_float32(), mi.Float((k // _SIDE) % _SIDE) + jitter.next_float32())
+        / _SIDE
+    )
     dr.eval(sample)
     wi = dr.gather(mi.Vector3f, wi, k // n)
     si = interaction(wi)

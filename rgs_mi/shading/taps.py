@@ -47,8 +47,11 @@ def taps(cosine, roughness, phi, entries=None) -> list:
     for k in range(COUNT):
         fetch = lambda i: dr.gather(mi.Vector4f, entries, first + k * (COSINES * ROUGHNESSES * FRACTIONS) + i)
         along = lambda i: dr.lerp(fetch(i), fetch(i + FRACTIONS), fx)
-        a, b, log_w, _ = dr.lerp(dr.lerp(along(0), along(ROUGHNESSES * FRACTIONS), fy),
-                                 dr.lerp(along(1), along(ROUGHNESSES * FRACTIONS + 1), fy), phi)
+        a, b, log_w, _ = dr.lerp(
+            dr.lerp(along(0), along(ROUGHNESSES * FRACTIONS), fy),
+            dr.lerp(along(1), along(ROUGHNESSES * FRACTIONS + 1), fy),
+            phi,
+        )
         found.append((a, dr.minimum(roughness * dr.exp(b), 1), dr.exp(log_w)))
     total = dr.rcp(sum(w for _, _, w in found))
     return [(a, r, w * total) for a, r, w in found]

@@ -57,7 +57,7 @@ class Layout:
 def _slopes(record, layout):
     """(∂n/∂u, ∂n/∂v) of a record, a list each."""
     end = len(GEOMETRY) + layout.features
-    return record[end:end + 3], record[end + 3:end + _SLOPES]
+    return record[end : end + 3], record[end + 3 : end + _SLOPES]
 
 
 def _turned(record, layout, offset):
@@ -67,7 +67,7 @@ def _turned(record, layout, offset):
 
 def _features(record, layout, offset):
     """The features of a record where a pixel meets it, ``offset`` (u, v) from its centre."""
-    values = record[len(GEOMETRY):len(GEOMETRY) + layout.features]
+    values = record[len(GEOMETRY) : len(GEOMETRY) + layout.features]
     for k, turn in enumerate(_turned(record, layout, offset), _NORMAL):
         values[k] = values[k] + turn
     return values
@@ -113,7 +113,7 @@ def _scatter_image(values, layout):
     for (row, inside), value in zip(_image_rows(layout), values):
         value = value + [mi.Float(0)] * (layout.pixel - len(value))
         for q in range(layout.pixel // PACKET):
-            dr.scatter(image, mi.Vector4f(*value[PACKET * q: PACKET * (q + 1)]), row * (layout.pixel // PACKET) + q, inside)
+            dr.scatter(image, mi.Vector4f(*value[PACKET * q : PACKET * (q + 1)]), row * (layout.pixel // PACKET) + q, inside)
     return image
 
 
@@ -130,7 +130,7 @@ class Composite(dr.CustomOp):
                 hit = Hit(r, x, y, layout.cutoffs)
                 w = T[k] * hit.alpha
                 features = _features(r, layout, hit.offset)
-                alpha, squares = out[k][n + 1] + w, [dr.fma(w, hit.t * hit.t, o) for o in out[k][n + 2:]]
+                alpha, squares = out[k][n + 1] + w, [dr.fma(w, hit.t * hit.t, o) for o in out[k][n + 2 :]]
                 out[k] = [dr.fma(w, value, o) for o, value in zip(out[k], [*features, hit.t])] + [alpha, *squares]
                 T[k] = T[k] - w
             return T, out
@@ -156,7 +156,7 @@ class Composite(dr.CustomOp):
             for k, (x, y) in enumerate(centres):
                 hit = Hit(r, x, y, layout.cutoffs)
                 w = T[k] * hit.alpha
-                g, d_normal = adjoint[k][n + 1], [w * a for a in adjoint[k][_NORMAL:_NORMAL + 3]]
+                g, d_normal = adjoint[k][n + 1], [w * a for a in adjoint[k][_NORMAL : _NORMAL + 3]]
                 for a, value in zip(adjoint[k], [*_features(r, layout, hit.offset), hit.t]):
                     g = dr.fma(a, value, g)
                 d_t = adjoint[k][n]
@@ -168,11 +168,16 @@ class Composite(dr.CustomOp):
                 d_offset = [sum((a * d for a, d in zip(slope, d_normal)), mi.Float(0)) for slope in _slopes(r, layout)]
                 local = hit.pull_back(r, d_alpha, w * d_t, d_offset)
                 local += [w * a for a in adjoint[k][:n]] + [d * a for d in hit.offset for a in d_normal]
-                total = [t + l for t, l in zip(total, local)] + total[len(local):]
+                total = [t + l for t, l in zip(total, local)] + total[len(local) :]
                 T[k] = T[k] - w
             for q in range(stride):
-                dr.scatter_reduce(dr.ReduceOp.Add, gradient, mi.Vector4f(*total[PACKET * q: PACKET * (q + 1)]),
-                                  surfel * stride + q, mode=mode)
+                dr.scatter_reduce(
+                    dr.ReduceOp.Add,
+                    gradient,
+                    mi.Vector4f(*total[PACKET * q : PACKET * (q + 1)]),
+                    surfel * stride + q,
+                    mode=mode,
+                )
             return T, rest
 
         dr.eval(_walk(self.lists, layout, lambda pixels: rest, body))
@@ -192,7 +197,7 @@ class Composite(dr.CustomOp):
                 for c, turn_ in enumerate(_turned(r, layout, offset_), _NORMAL):
                     values_[c] = values_[c] + turn_
                 w, w_ = T[k] * hit.alpha, T_ * hit.alpha + T[k] * alpha_
-                squares = [o + (w_ * hit.t + 2 * w * t_) * hit.t for o in out_[n + 2:]]
+                squares = [o + (w_ * hit.t + 2 * w * t_) * hit.t for o in out_[n + 2 :]]
                 out_ = [o + w_ * f + w * f_ for o, f, f_ in zip(out_, [*values, hit.t], [*values_, t_])]
                 out_ += [state[k][1][n + 1] + w_, *squares]
                 state[k], T[k] = (T_ - w_, out_), T[k] - w

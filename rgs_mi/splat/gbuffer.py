@@ -16,11 +16,11 @@ from .tiles import Cutoffs
 class Maps:
     """Accumulated attributes, a lane a pixel; each is Σ w · attribute, so divide by ``alpha`` for means.
 
-      diffuse        Σ w c, linear radiance                 ``mi.Color3f``
-      normal         Σ w (n(u, v) + Δn), world space        ``mi.Vector3f``
-      base_color, roughness, metallic, depth (z), alpha = Σ w
-      delta_normal   Σ w Δn                                 ``mi.Vector3f``
-      square         Σ w z²; this and delta_normal where `render_gbuffer` was asked for all maps, else None
+    diffuse        Σ w c, linear radiance                 ``mi.Color3f``
+    normal         Σ w (n(u, v) + Δn), world space        ``mi.Vector3f``
+    base_color, roughness, metallic, depth (z), alpha = Σ w
+    delta_normal   Σ w Δn                                 ``mi.Vector3f``
+    square         Σ w z²; this and delta_normal where `render_gbuffer` was asked for all maps, else None
     """
 
     diffuse: "mi.Color3f"
@@ -54,8 +54,17 @@ class GBuffer:
         packets = 5 if self.full else 4
         m = [v for q in range(packets) for v in dr.gather(mi.Vector4f, self.image, index * packets + q)]
         delta, m[11:] = (mi.Vector3f(*m[11:14]), m[14:]) if self.full else (None, m[11:])
-        return Maps(mi.Color3f(*m[0:3]), mi.Vector3f(*m[3:6]), mi.Color3f(*m[6:9]), m[9], m[10], m[11], m[12], delta,
-                    m[13] if self.full else None)
+        return Maps(
+            mi.Color3f(*m[0:3]),
+            mi.Vector3f(*m[3:6]),
+            mi.Color3f(*m[6:9]),
+            m[9],
+            m[10],
+            m[11],
+            m[12],
+            delta,
+            m[13] if self.full else None,
+        )
 
 
 def render_gbuffer(surfels, camera, screen_offset=None, cutoffs=Cutoffs(), full=False) -> GBuffer:
@@ -63,8 +72,14 @@ def render_gbuffer(surfels, camera, screen_offset=None, cutoffs=Cutoffs(), full=
     maps that only regularisers want, too."""
     projected = project(surfels, camera, screen_offset)
     delta = surfels.column(mi.Vector3f, "delta_normal")
-    features = [*surfels.radiance(projected.view), *(projected.normal + delta), *surfels.column(mi.Color3f, "base_color"),
-                surfels.column(mi.Float, "roughness"), surfels.column(mi.Float, "metallic"), *(delta if full else ())]
+    features = [
+        *surfels.radiance(projected.view),
+        *(projected.normal + delta),
+        *surfels.column(mi.Color3f, "base_color"),
+        surfels.column(mi.Float, "roughness"),
+        surfels.column(mi.Float, "metallic"),
+        *(delta if full else ()),
+    ]
     dr.eval(projected.geometry, features, projected.slopes)
     lists = lane_lists(projected, camera.size, cutoffs)
     image = composite(projected, features, lists, Layout(camera.size, len(features), cutoffs, squares=full))

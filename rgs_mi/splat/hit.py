@@ -35,7 +35,7 @@ def pack(columns):
     out = dr.empty(mi.Float, max(_LEAST_ROWS, 1 << (n - 1).bit_length()) * stride)
     row = dr.arange(mi.UInt32, n) * (stride // PACKET)
     for q in range(stride // PACKET):
-        dr.scatter(out, mi.Vector4f(*columns[PACKET * q: PACKET * (q + 1)]), row + q)
+        dr.scatter(out, mi.Vector4f(*columns[PACKET * q : PACKET * (q + 1)]), row + q)
     return out
 
 
@@ -51,7 +51,7 @@ class Hit:
     """One pixel against one record: equation (1) of `project.py` and the weight of (2) of `composite.py`."""
 
     def __init__(self, record, x, y, cutoffs):
-        X, Y, A_x, A_y, B_x, B_y, N_x, N_y, z, opacity = record[:len(GEOMETRY)]
+        X, Y, A_x, A_y, B_x, B_y, N_x, N_y, z, opacity = record[: len(GEOMETRY)]
         self.dx, self.dy = x - X, y - Y
         h = 1 + N_x * self.dx + N_y * self.dy
         in_front = h > HORIZON
@@ -71,7 +71,7 @@ class Hit:
 
     def sort_key(self, record, cutoffs):
         """t, if this hit is in the middle of a lane's pixels, and −∞ where none of them can see the surfel."""
-        _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, opacity = record[:len(GEOMETRY)]
+        _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, opacity = record[: len(GEOMETRY)]
         tilt = _HALF_DIAGONAL * dr.sqrt(N_x * N_x + N_y * N_y)
         turn = _HALF_DIAGONAL * dr.sqrt(A_x * A_x + A_y * A_y + B_x * B_x + B_y * B_y)
         # From the middle to a pixel, h changes by at most tilt, and (u, v) by (turn + |(u, v)| tilt) / h there
@@ -84,23 +84,35 @@ class Hit:
 
     def pull_back(self, record, d_alpha, d_t, d_offset):
         """Gradient of the ten geometric numbers, from that of α, t and the offset."""
-        _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, _ = record[:len(GEOMETRY)]
+        _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, _ = record[: len(GEOMETRY)]
         d_alpha = dr.select(self.kept & ~self.clamped, d_alpha, 0)
         d_rho = -0.5 * self.alpha * d_alpha
         plane = lambda value: dr.select(self.on_plane, value, 0)
-        d_u, d_v = (plane((2 * value * d_rho + d_value) * self.inv_h)  # both over h
-                    for value, d_value in zip((self.u, self.v), d_offset))
+        d_u, d_v = (
+            plane((2 * value * d_rho + d_value) * self.inv_h)  # both over h
+            for value, d_value in zip((self.u, self.v), d_offset)
+        )
         d_h = -(d_u * self.u + d_v * self.v) - plane(d_t * self.t * self.inv_h)
         d_screen = dr.select(self.on_plane, 0, 2 * LOW_PASS * d_rho)
         d_dx = d_u * A_x + d_v * B_x + d_h * N_x + d_screen * self.dx
         d_dy = d_u * A_y + d_v * B_y + d_h * N_y + d_screen * self.dy
-        return [-d_dx, -d_dy, d_u * self.dx, d_u * self.dy, d_v * self.dx, d_v * self.dy, d_h * self.dx, d_h * self.dy,
-                dr.select(self.on_plane, d_t * self.inv_h, d_t), d_alpha * self.gauss]
+        return [
+            -d_dx,
+            -d_dy,
+            d_u * self.dx,
+            d_u * self.dy,
+            d_v * self.dx,
+            d_v * self.dy,
+            d_h * self.dx,
+            d_h * self.dy,
+            dr.select(self.on_plane, d_t * self.inv_h, d_t),
+            d_alpha * self.gauss,
+        ]
 
     def push_forward(self, record, tangent):
         """The tangents of α, t and the offset, from that of the record."""
-        _, _, A_x, A_y, B_x, B_y, N_x, N_y, z, _ = record[:len(GEOMETRY)]
-        X_, Y_, A_x_, A_y_, B_x_, B_y_, N_x_, N_y_, z_, opacity_ = tangent[:len(GEOMETRY)]
+        _, _, A_x, A_y, B_x, B_y, N_x, N_y, z, _ = record[: len(GEOMETRY)]
+        X_, Y_, A_x_, A_y_, B_x_, B_y_, N_x_, N_y_, z_, opacity_ = tangent[: len(GEOMETRY)]
         h_ = N_x_ * self.dx + N_y_ * self.dy - N_x * X_ - N_y * Y_
         u_ = (A_x_ * self.dx + A_y_ * self.dy - A_x * X_ - A_y * Y_ - self.u * h_) * self.inv_h
         v_ = (B_x_ * self.dx + B_y_ * self.dy - B_x * X_ - B_y * Y_ - self.v * h_) * self.inv_h

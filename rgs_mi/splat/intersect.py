@@ -64,8 +64,10 @@ class _Outline:
         y_disk = dr.clip(self.y, low, high) - self.y
         in_disk = dr.abs(y_disk) < self.r
         chord_disk = dr.sqrt(dr.maximum(self.r * self.r - y_disk * y_disk, 0))
-        return (dr.select(in_disk, dr.minimum(x_min, self.x - chord_disk), x_min),
-                dr.select(in_disk, dr.maximum(x_max, self.x + chord_disk), x_max))
+        return (
+            dr.select(in_disk, dr.minimum(x_min, self.x - chord_disk), x_min),
+            dr.select(in_disk, dr.maximum(x_max, self.x + chord_disk), x_max),
+        )
 
 
 def _outline(geometry, alpha_min):
@@ -84,8 +86,9 @@ def _outline(geometry, alpha_min):
     ellipse = lambda value, everywhere: dr.select(bounded, value, everywhere)
     e_x, e_y, i01 = (ellipse(v, 0) for v in (e_x, e_y, i01))
     i00, i11, k = ellipse(i00, 1), ellipse(i11, 1), ellipse(k, FAR * FAR)
-    return _Outline(x + e_x, y + e_y, dr.sqrt(k * i00), dr.sqrt(k * i11), i00, i01, i11, k, x, y,
-                    dr.sqrt(r2 / LOW_PASS)), r2 > 0
+    return _Outline(
+        x + e_x, y + e_y, dr.sqrt(k * i00), dr.sqrt(k * i11), i00, i01, i11, k, x, y, dr.sqrt(r2 / LOW_PASS)
+    ), r2 > 0
 
 
 def _depth_at_tile(geometry, column, row):

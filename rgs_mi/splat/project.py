@@ -38,10 +38,12 @@ def opaque(camera):
     """The camera's numbers as opaque Dr.Jit values (literals would recompile the kernels at every pose):
     (rotation world-to-camera ``Matrix3f``, origin ``Point3f``, focal ``Vector2f``, principal ``Vector2f``)."""
     scalar = lambda v: dr.opaque(mi.Float, float(v))
-    return (mi.Matrix3f([[scalar(v) for v in row] for row in camera.rotation]),
-            mi.Point3f(*map(scalar, camera.origin)),
-            mi.Vector2f(*map(scalar, camera.focal)),
-            mi.Vector2f(*map(scalar, camera.principal)))
+    return (
+        mi.Matrix3f([[scalar(v) for v in row] for row in camera.rotation]),
+        mi.Point3f(*map(scalar, camera.origin)),
+        mi.Vector2f(*map(scalar, camera.focal)),
+        mi.Vector2f(*map(scalar, camera.principal)),
+    )
 
 
 def project(surfels, camera, screen_offset=None) -> Projected:
@@ -75,5 +77,10 @@ def project(surfels, camera, screen_offset=None) -> Projected:
     B = mi.Vector2f(b.x / f.x, b.y / f.y) * z - dr.dot(p, b) * N
     opacity = surfels.column(mi.Float, "opacities")
     turned = lambda v: dr.select(facing > 0, -v, v)
-    return Projected([x, y, A.x, A.y, B.x, B.y, N.x, N.y, z, opacity],
-                     offset / distance, turned(n_world), tuple(map(turned, surfels.slopes())), visible)
+    return Projected(
+        [x, y, A.x, A.y, B.x, B.y, N.x, N.y, z, opacity],
+        offset / distance,
+        turned(n_world),
+        tuple(map(turned, surfels.slopes())),
+        visible,
+    )

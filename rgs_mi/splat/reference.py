@@ -85,6 +85,10 @@ def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> Maps:
         diffuse=accumulate(mi.Color3f, radiance),
         normal=accumulate(mi.Vector3f, dr.select(facing > 0, -normal, normal) + delta),
         base_color=accumulate(mi.Color3f, of(mi.Color3f, "base_color")),
-        roughness=accumulate(mi.Float, of(mi.Float, "roughness")), metallic=accumulate(mi.Float, of(mi.Float, "metallic")),
-        delta_normal=accumulate(mi.Vector3f, delta), depth=accumulate(mi.Float, z),
-        alpha=accumulate(mi.Float, mi.Float(1)), square=accumulate(mi.Float, z * z))
+        roughness=accumulate(mi.Float, of(mi.Float, "roughness")),
+        metallic=accumulate(mi.Float, of(mi.Float, "metallic")),
+        delta_normal=accumulate(mi.Vector3f, delta),
+        depth=accumulate(mi.Float, z),
+        alpha=accumulate(mi.Float, mi.Float(1)),
+        square=accumulate(mi.Float, z * z),
+    )

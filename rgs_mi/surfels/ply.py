@@ -85,8 +85,10 @@ def read_ply(path) -> dict[str, np.ndarray]:
 
     count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertices.dtype.names)
     if count not in (0, 9, 24, 45):
-        raise UserError(f"{path}: {count} properties f_rest_*, which is no spherical-harmonics degree from 0 to 3: "
-                        "expected 0, 9, 24 or 45")
+        raise UserError(
+            f"{path}: {count} properties f_rest_*, which is no spherical-harmonics degree from 0 to 3: "
+            "expected 0, 9, 24 or 45"
+        )
     n, dc = len(vertices), fields.pop("f_dc")
     rest = _columns(path, vertices, [f"f_rest_{i}" for i in range(count)]).reshape(n, 3, -1).transpose(0, 2, 1)
     fields["sh"] = np.concatenate([dc, rest.reshape(n, -1)], 1)
@@ -102,11 +104,12 @@ def read_ply(path) -> dict[str, np.ndarray]:
         fields["scales"] = np.maximum(np.exp(fields["scales"].astype(np.float64)), _TINY)
     length = np.linalg.norm(fields["rotations"].astype(np.float64), axis=1, keepdims=True)
     if not length.all():
-        raise UserError(f"{path}: 'rot_*' is zero at vertex {length.argmin()}: "
-                        "remove such surfels or export the file again")
+        raise UserError(f"{path}: 'rot_*' is zero at vertex {length.argmin()}: remove such surfels or export the file again")
     if fields["scales"].max() > np.finfo(np.float32).max:
-        raise UserError(f"{path}: 'scale_*' is too large at vertex {fields['scales'].max(1).argmax()}: "
-                        "scales are stored as natural logarithms")
+        raise UserError(
+            f"{path}: 'scale_*' is too large at vertex {fields['scales'].max(1).argmax()}: "
+            "scales are stored as natural logarithms"
+        )
     fields["rotations"] = fields["rotations"] / length
     return {field: np.ascontiguousarray(value, np.float32) for field, value in fields.items()}
 
@@ -121,8 +124,10 @@ def _read_vertices(path):
             raise UserError(f"{path}: not a PLY file (its first line must be 'ply'): check the path")
         for name, count in re.findall(rb"[\r\n]element\s+(\S+)\s+(-?\d+)", header):
             if not 0 <= int(count) <= size:
-                raise UserError(f"{path}: declares {int(count)} elements '{name.decode('ascii', 'replace')}' in {size} "
-                                "bytes: the file is damaged, export it again")
+                raise UserError(
+                    f"{path}: declares {int(count)} elements '{name.decode('ascii', 'replace')}' in {size} "
+                    "bytes: the file is damaged, export it again"
+                )
         if re.search(rb"[\r\n]property\s+list\b", header):
             raise UserError(f"{path}: has list properties, as a mesh does: {_REMEDY}")
         ply = PlyData.read(str(path))
@@ -147,6 +152,8 @@ def _columns(path, vertices, names):
         for i, name in enumerate(names):
             table[:, i] = vertices[name]
             if not np.isfinite(table[:, i]).all():
-                raise UserError(f"{path}: '{name}' is not finite at vertex {np.isfinite(table[:, i]).argmin()}: "
-                                "remove such surfels or export the file again")
+                raise UserError(
+                    f"{path}: '{name}' is not finite at vertex {np.isfinite(table[:, i]).argmin()}: "
+                    "remove such surfels or export the file again"
+                )
     return table

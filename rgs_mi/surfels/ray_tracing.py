@@ -50,10 +50,22 @@ class SurfelRays:
         with dr.suspend_grad():
             self.proxies = Proxies(surfels, _CUTOFFS.alpha_min, box)
             column = surfels.column
-            self.shape = pack([column(mi.Float, "opacities"), self.proxies.extent, *self.proxies.normal,
-                               *(value for slope in surfels.slopes() for value in slope)])
-            self.material = pack([*column(mi.Vector3f, "delta_normal"), *column(mi.Color3f, "base_color"),
-                                  column(mi.Float, "roughness"), column(mi.Float, "metallic")])
+            self.shape = pack(
+                [
+                    column(mi.Float, "opacities"),
+                    self.proxies.extent,
+                    *self.proxies.normal,
+                    *(value for slope in surfels.slopes() for value in slope),
+                ]
+            )
+            self.material = pack(
+                [
+                    *column(mi.Vector3f, "delta_normal"),
+                    *column(mi.Color3f, "base_color"),
+                    column(mi.Float, "roughness"),
+                    column(mi.Float, "metallic"),
+                ]
+            )
             self.sh, self.channels = dr.detach(surfels.sh.array), surfels.sh.shape[1]
             self.thickness = _THICKNESS * self.proxies.clearance
             dr.eval(self.shape, self.material, self.sh, self.thickness)
@@ -86,8 +98,15 @@ class SurfelRays:
             active &= goes_on
         mean = dr.rcp(dr.maximum(1 - remaining, _CUTOFFS.alpha_min))
         length = dr.norm(normal)
-        return Met(found & (length > 0), t * mean, normal / dr.select(length > 0, length, 1), roughness * mean,
-                   metallic * mean, base_color * mean, number)
+        return Met(
+            found & (length > 0),
+            t * mean,
+            normal / dr.select(length > 0, length, 1),
+            roughness * mean,
+            metallic * mean,
+            base_color * mean,
+            number,
+        )
 
     @dr.syntax
     def transmittance(self, ray, reach, leaves, active):
@@ -125,7 +144,7 @@ class SurfelRays:
         met, number = active & hit.is_valid(), hit.prim_index // 2
         distance = passed + dr.select(met, hit.t, 0)
         opacity, extent, *vectors = fetch(self.shape, number, _SHAPE, met)[:11]
-        normal, slope_u, slope_v = (mi.Vector3f(*vectors[k:k + 3]) for k in (0, 3, 6))
+        normal, slope_u, slope_v = (mi.Vector3f(*vectors[k : k + 3]) for k in (0, 3, 6))
         u, v = (extent * value for value in self.proxies.position(hit))
         alpha = opacity * dr.exp(-0.5 * (u * u + v * v))
         away = dr.dot(normal, ray.d) > 0

@@ -11,8 +11,18 @@ import mitsuba as mi
 import numpy as np
 
 #: Channels of each field; `sh` has 3 (L+1)^2 of them, coefficient-major: sh[:, 3 k + c] is coefficient k of colour c.
-CHANNELS = {"centers": 3, "rotations": 4, "scales": 2, "opacities": 1, "sh": None, "base_color": 3, "roughness": 1,
-            "metallic": 1, "delta_normal": 3, "curvature": 3}
+CHANNELS = {
+    "centers": 3,
+    "rotations": 4,
+    "scales": 2,
+    "opacities": 1,
+    "sh": None,
+    "base_color": 3,
+    "roughness": 1,
+    "metallic": 1,
+    "delta_normal": 3,
+    "curvature": 3,
+}
 SH_0 = 0.28209479  # the spherical harmonic of order 0
 
 
@@ -20,16 +30,16 @@ SH_0 = 0.28209479  # the spherical harmonic of order 0
 class Surfels:
     """N surfels. Every field is a ``mi.TensorXf`` of shape [N, channels] in its physical range.
 
-      centers       world space
-      rotations     unit quaternions (x, y, z, w); the columns of their matrix are the tangents t_u, t_v and the normal
-      scales        standard deviations along t_u and t_v, world units, > 0
-      opacities     in (0, 1)
-      sh            diffuse radiance, linear: max(0, 1/2 + sum_k sh_k Y_k(d)), d from the camera to the centre (3DGS)
-      base_color, roughness, metallic   principled BSDF parameters in [0, 1]
-      delta_normal  the residual Δn that is added to the normal (RGS, eq. of N)
-      curvature     K_uu, K_uv, K_vv: how the normal turns across the surfel, radians per √(s_u s_v); see `slopes`
-      two_sided     whether surfels show from behind, with the normal turned to the camera (2DGS); one-sided ones, whose
-                    normals point outwards, keep the far side of a closed object from bending its silhouette's normals
+    centers       world space
+    rotations     unit quaternions (x, y, z, w); the columns of their matrix are the tangents t_u, t_v and the normal
+    scales        standard deviations along t_u and t_v, world units, > 0
+    opacities     in (0, 1)
+    sh            diffuse radiance, linear: max(0, 1/2 + sum_k sh_k Y_k(d)), d from the camera to the centre (3DGS)
+    base_color, roughness, metallic   principled BSDF parameters in [0, 1]
+    delta_normal  the residual Δn that is added to the normal (RGS, eq. of N)
+    curvature     K_uu, K_uv, K_vv: how the normal turns across the surfel, radians per √(s_u s_v); see `slopes`
+    two_sided     whether surfels show from behind, with the normal turned to the camera (2DGS); one-sided ones, whose
+                  normals point outwards, keep the far side of a closed object from bending its silhouette's normals
     """
 
     centers: "mi.TensorXf"
@@ -51,8 +61,9 @@ class Surfels:
     def from_numpy(cls, arrays: dict, two_sided=True) -> "Surfels":
         """From float32 arrays, one a field; without ``curvature`` normals are the same all over each surfel."""
         arrays = {"curvature": np.zeros((len(arrays["centers"]), 3))} | arrays
-        return cls(**{name: mi.TensorXf(np.ascontiguousarray(arrays[name], np.float32)) for name in CHANNELS},
-                   two_sided=two_sided)
+        return cls(
+            **{name: mi.TensorXf(np.ascontiguousarray(arrays[name], np.float32)) for name in CHANNELS}, two_sided=two_sided
+        )
 
     def numpy(self) -> dict[str, np.ndarray]:
         """One float32 array a field, detached."""
@@ -73,6 +84,7 @@ class Surfels:
 
     def take(self, number) -> "Surfels":
         """The surfels ``number`` (``mi.UInt32``, repeats allowed)."""
+
         def rows(tensor):
             count, channels = dr.width(number), tensor.shape[1]
             lane = dr.arange(mi.UInt32, count * channels)

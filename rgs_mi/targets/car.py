@@ -11,9 +11,9 @@ from . import implicit
 from .meshes import Mesh, between, divide, join, lathe, mirrored, rounded, tube
 
 STEP = 0.0105
-AXLES, HUB = (0.585, -0.575), -0.165                    # x of the axles, z of their middles
-TYRE, RIM, TRACK, WELL = 0.150, 0.106, 0.335, 0.167     # radii of tyre and rim, |y| of the wheels, radius of their houses
-SILL = -0.215                                           # z of the underside
+AXLES, HUB = (0.585, -0.575), -0.165  # x of the axles, z of their middles
+TYRE, RIM, TRACK, WELL = 0.150, 0.106, 0.335, 0.167  # radii of tyre and rim, |y| of the wheels, radius of their houses
+SILL = -0.215  # z of the underside
 
 
 def _step(x, start, end):
@@ -27,6 +27,7 @@ def _bump(x, middle, width):
 
 
 # ---- The body ----
+
 
 def _nose(p):
     return (p[:, 0] - 0.955 + 0.55 * p[:, 1] ** 2 + 0.6 * (p[:, 2] + 0.11) ** 2) / 1.1
@@ -80,6 +81,7 @@ def _field(p):
 
 
 # ---- What is drawn on it ----
+
 
 def _x(p):
     return p[:, 0]
@@ -140,20 +142,29 @@ def _body() -> dict[str, Mesh]:
     regions = [
         ("glass", (_side_window, on_side, lambda p: -0.145 - _x(p))),
         ("glass", (_side_window, on_side, lambda p: _x(p) + 0.175)),
-        ("glass", (_front_window, ahead, on_cabin)), ("glass", (_rear_window, behind, on_cabin)),
-        ("trim", (_wider(_side_window, 0.011), on_side)), ("seams", (_wider(_front_window, 0.007), ahead, on_cabin)),
+        ("glass", (_front_window, ahead, on_cabin)),
+        ("glass", (_rear_window, behind, on_cabin)),
+        ("trim", (_wider(_side_window, 0.011), on_side)),
+        ("seams", (_wider(_front_window, 0.007), ahead, on_cabin)),
         ("seams", (_wider(_rear_window, 0.007), behind, on_cabin)),
         ("headlamps", (_ellipse(*headlamp), ahead_of)),
         ("trim", (_ellipse(*headlamp, frame=0.010), _wider(ahead_of, 0.010))),
-        ("taillamps", (_ellipse(*taillamp), back)), ("trim", (_ellipse(*taillamp, frame=0.009), back)),
-        *slats, ("underside", (front, grille)), ("trim", (front, _wider(grille, 0.010))),
-        ("underside", (lambda p: _axle_distance(p) - WELL - 0.003,)), ("underside", (lambda p: _z(p) - SILL - 0.012,)),
-        ("trim", (lambda p: _axle_distance(p) - WELL - 0.011, on_side)), ("trim", (lambda p: _z(p) - SILL - 0.030, on_side)),
-        *doors]
+        ("taillamps", (_ellipse(*taillamp), back)),
+        ("trim", (_ellipse(*taillamp, frame=0.009), back)),
+        *slats,
+        ("underside", (front, grille)),
+        ("trim", (front, _wider(grille, 0.010))),
+        ("underside", (lambda p: _axle_distance(p) - WELL - 0.003,)),
+        ("underside", (lambda p: _z(p) - SILL - 0.012,)),
+        ("trim", (lambda p: _axle_distance(p) - WELL - 0.011, on_side)),
+        ("trim", (lambda p: _z(p) - SILL - 0.030, on_side)),
+        *doors,
+    ]
     return divide(mesh, regions, rest="paint")
 
 
 # ---- Wheels ----
+
 
 def _at_wheels(mesh: Mesh) -> Mesh:
     """Four copies of what stands for the left wheels, its middle at the origin, y outward."""
@@ -162,8 +173,16 @@ def _at_wheels(mesh: Mesh) -> Mesh:
 
 
 def tyres() -> Mesh:
-    corners = [[RIM - 0.01, 0.045], [RIM + 0.004, 0.052], [TYRE - 0.012, 0.052], [TYRE, 0.034], [TYRE, -0.034],
-               [TYRE - 0.012, -0.052], [RIM + 0.004, -0.052], [RIM - 0.01, -0.045]]
+    corners = [
+        [RIM - 0.01, 0.045],
+        [RIM + 0.004, 0.052],
+        [TYRE - 0.012, 0.052],
+        [TYRE, 0.034],
+        [TYRE, -0.034],
+        [TYRE - 0.012, -0.052],
+        [RIM + 0.004, -0.052],
+        [RIM - 0.01, -0.045],
+    ]
     ring = rounded([*corners, corners[0]], [0, 0.008, 0.014, 0.016, 0.016, 0.014, 0.008, 0.008, 0])
     return _at_wheels(lathe(ring, np.zeros(3), [0, 1, 0], sides=72))
 
@@ -171,7 +190,7 @@ def tyres() -> Mesh:
 def _rim_field(p):
     r, y = np.hypot(p[:, 0], p[:, 2]), p[:, 1]
     a = np.arctan2(p[:, 2], p[:, 0])
-    a = (a + np.pi / 5) % (2 * np.pi / 5) - np.pi / 5          # five spokes
+    a = (a + np.pi / 5) % (2 * np.pi / 5) - np.pi / 5  # five spokes
     u, v = r * np.cos(a), r * np.sin(a)
     face = 0.034 + 0.016 * (r / RIM) ** 2 - 0.012 * _bump(r, 0.0, 0.02)
     slab = implicit.intersection(y - face, face - 0.020 - y, 0.012)
@@ -195,6 +214,7 @@ def brakes() -> Mesh:
 
 
 # ---- What sticks out ----
+
 
 def _spindle(curve, up, width: float, height: float) -> Mesh:
     """A tube with round ends."""
@@ -239,7 +259,15 @@ def exhausts() -> Mesh:
     return join(pipe, mirrored(pipe))
 
 
-PARTS = {**{name: lambda name=name: _body()[name] for name in
-            ("paint", "glass", "trim", "seams", "headlamps", "taillamps", "underside")},
-         **{name: lambda name=name: _mirrors()[name] for name in ("mirrors", "mirror_glass")},
-         "tyres": tyres, "rims": rims, "brakes": brakes, "bumpers": bumpers, "exhausts": exhausts}
+PARTS = {
+    **{
+        name: lambda name=name: _body()[name]
+        for name in ("paint", "glass", "trim", "seams", "headlamps", "taillamps", "underside")
+    },
+    **{name: lambda name=name: _mirrors()[name] for name in ("mirrors", "mirror_glass")},
+    "tyres": tyres,
+    "rims": rims,
+    "brakes": brakes,
+    "bumpers": bumpers,
+    "exhausts": exhausts,
+}

@@ -10,11 +10,12 @@ import numpy as np
 
 from .meshes import Mesh, grid, join, lathe, mirrored, tube, unit
 
-COLUMNS = 384                                           # points around the helmet
-ROWS = {"crown": 110, "stripe": 10, "base": 110}        # and from the top to the edge
+COLUMNS = 384  # points around the helmet
+ROWS = {"crown": 110, "stripe": 10, "base": 110}  # and from the top to the edge
 
 
 # ---- The shell ----
+
 
 def direction(azimuth, elevation) -> np.ndarray:
     """[..., 3] unit vectors."""
@@ -101,9 +102,10 @@ def lining() -> Mesh:
 
 # ---- The visor ----
 
+
 def _visor_point(rho, psi) -> tuple[np.ndarray, np.ndarray]:
     """Azimuth and elevation at polar coordinates of the visor's opening (rho = 1 is its boundary)."""
-    r = rho * (np.abs(np.cos(psi)) ** 4 + np.abs(np.sin(psi)) ** 4) ** -0.25       # a rounded rectangle
+    r = rho * (np.abs(np.cos(psi)) ** 4 + np.abs(np.sin(psi)) ** 4) ** -0.25  # a rounded rectangle
     x, y = r * np.cos(psi), r * np.sin(psi)
     return 1.22 * x, np.radians(5) + np.radians(22 - 7 * x**2) * y
 
@@ -124,6 +126,7 @@ def visor_trim() -> Mesh:
 
 
 # ---- Ornaments ----
+
 
 def _spindle(azimuth, elevation, width: float, height: float) -> Mesh:
     """A tube along a curve on the shell, pointed at both ends like a seed."""
@@ -153,8 +156,10 @@ def ridge() -> Mesh:
 
 def vents() -> Mesh:
     """Three slats on the chin and a scoop on each side of the brow."""
-    slats = [_spindle(_cosine(-a, a), np.radians(np.full(161, e)), 0.020, 0.026)
-             for a, e in ((0.34, -29), (0.28, -34.5), (0.21, -40))]
+    slats = [
+        _spindle(_cosine(-a, a), np.radians(np.full(161, e)), 0.020, 0.026)
+        for a, e in ((0.34, -29), (0.28, -34.5), (0.21, -40))
+    ]
     cheek = _spindle(_cosine(0.55, 1.05), np.radians(_cosine(-33, -26)), 0.026, 0.032)
     return join(*slats, cheek, mirrored(cheek))
 
@@ -166,11 +171,26 @@ def knobs() -> Mesh:
     t = np.linspace(0, np.pi / 2, 24)
     rounded = lambda r, h, k: np.stack([r - k + k * np.sin(t), h - k + k * np.cos(t)], -1)
     # Doubled points keep creases sharp under smooth normals.
-    profile = np.vstack([[[0, 0.068]], rounded(0.046, 0.068, 0.016), [[0.046, 0.046], [0.047, 0.044]],
-                         rounded(0.092, 0.044, 0.020), [[0.092, -0.048], [0.091, -0.050], [0, -0.050]]])
+    profile = np.vstack(
+        [
+            [[0, 0.068]],
+            rounded(0.046, 0.068, 0.016),
+            [[0.046, 0.046], [0.047, 0.044]],
+            rounded(0.092, 0.044, 0.020),
+            [[0.092, -0.048], [0.091, -0.050], [0, -0.050]],
+        ]
+    )
     knob = lathe(profile, origin, axis)
     return join(knob, mirrored(knob))
 
 
-PARTS = {**{name: functools.partial(_band, name) for name in ROWS}, "edge_trim": edge_trim, "lining": lining,
-         "visor": visor, "visor_trim": visor_trim, "ridge": ridge, "vents": vents, "knobs": knobs}
+PARTS = {
+    **{name: functools.partial(_band, name) for name in ROWS},
+    "edge_trim": edge_trim,
+    "lining": lining,
+    "visor": visor,
+    "visor_trim": visor_trim,
+    "ridge": ridge,
+    "vents": vents,
+    "knobs": knobs,
+}

@@ -9,13 +9,14 @@ import numpy as np
 
 from .meshes import Mesh, unit
 
-BLOCK = 8               # grid points along a block that is skipped as a whole where the surface is far
-CHUNK = 1 << 17         # points that are evaluated together
-FAR = 0.3               # beyond it only a bound of the distance from a curve is needed
-EPSILON = 1e-4          # step of the differences that give a gradient
+BLOCK = 8  # grid points along a block that is skipped as a whole where the surface is far
+CHUNK = 1 << 17  # points that are evaluated together
+FAR = 0.3  # beyond it only a bound of the distance from a curve is needed
+EPSILON = 1e-4  # step of the differences that give a gradient
 
 
 # ---- Combining solids ----
+
 
 def union(a, b, radius):
     """Both solids, the crease between them filled with a fillet of about ``radius``."""
@@ -34,6 +35,7 @@ def difference(a, b, radius):
 
 
 # ---- Solids ----
+
 
 def box(p, half, radius):
     """A box of half extents ``half`` [3] with edges and corners of ``radius``."""
@@ -80,6 +82,7 @@ def swept(p, control, radii):
 
 
 # ---- Surface ----
+
 
 def gradient(f, p):
     """[N, 3] derivative of a field, from the corners of a small tetrahedron."""
@@ -140,11 +143,13 @@ def _untangle(values):
     while True:
         tangled = []
         for axis in range(3):
-            corners = [_shift(np.insert(c, axis, 0), np.add(values.shape, np.eye(3, dtype=int)[axis]))
-                       for c in ((0, 0), (0, 1), (1, 1), (1, 0))]
+            corners = [
+                _shift(np.insert(c, axis, 0), np.add(values.shape, np.eye(3, dtype=int)[axis]))
+                for c in ((0, 0), (0, 1), (1, 1), (1, 0))
+            ]
             a, b, c, d = (values[corner] < 0 for corner in corners)
             where = np.argwhere((a == c) & (b == d) & (a != b))
-            four = np.stack([where + [s.start for s in corner] for corner in corners])          # [4, S, 3] grid points
+            four = np.stack([where + [s.start for s in corner] for corner in corners])  # [4, S, 3] grid points
             least = np.abs(values[tuple(four.transpose(2, 0, 1))]).argmin(0)
             tangled.append(four[least, np.arange(len(where))])
         points = np.unique(np.concatenate(tangled), axis=0)

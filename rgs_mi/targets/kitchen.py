@@ -4,7 +4,7 @@ import numpy as np
 
 from .paint import box, dice, mix, noise, pick, room, rows, tiles, where
 
-KITCHEN = (2.6, 2.2), -0.95, 1.65           # half sizes, floor, ceiling
+KITCHEN = (2.6, 2.2), -0.95, 1.65  # half sizes, floor, ceiling
 
 
 def _garden(u, v):

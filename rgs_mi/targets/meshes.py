@@ -53,9 +53,11 @@ class Mesh:
         a, b, c = _rotated(faces[whole], (sides[whole] == -np.sign(sides[whole].sum(1, keepdims=True))).argmax(1))
         p, q = at(a, b), at(a, c)
         pieces += [np.stack(triple, -1) for triple in ((a, p, q), (p, b, c), (p, c, q))]
-        return Mesh(np.concatenate([self.vertices, mix(self.vertices).astype(np.float32)]),
-                    np.concatenate(pieces).astype(np.uint32),
-                    np.concatenate([self.normals, unit(mix(self.normals)).astype(np.float32)]))
+        return Mesh(
+            np.concatenate([self.vertices, mix(self.vertices).astype(np.float32)]),
+            np.concatenate(pieces).astype(np.uint32),
+            np.concatenate([self.normals, unit(mix(self.normals)).astype(np.float32)]),
+        )
 
     def moved(self, offset) -> "Mesh":
         """Shifted by ``offset`` [3]."""
@@ -184,9 +186,11 @@ def rounded(corners, cuts, steps: int = 8) -> np.ndarray:
 def join(*meshes: Mesh) -> Mesh:
     """Several meshes as one."""
     offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
-    return Mesh(np.concatenate([m.vertices for m in meshes]),
-                np.concatenate([m.faces + o for m, o in zip(meshes, offsets)]).astype(np.uint32),
-                np.concatenate([m.normals for m in meshes]))
+    return Mesh(
+        np.concatenate([m.vertices for m in meshes]),
+        np.concatenate([m.faces + o for m, o in zip(meshes, offsets)]).astype(np.uint32),
+        np.concatenate([m.normals for m in meshes]),
+    )
 
 
 def mirrored(mesh: Mesh) -> Mesh:

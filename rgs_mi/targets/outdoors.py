@@ -4,7 +4,7 @@ import numpy as np
 
 from .paint import dice, mix, noise, pick, rows, where
 
-EYE = 0.5               # height of the object's middle over the ground, in units of the object
+EYE = 0.5  # height of the object's middle over the ground, in units of the object
 
 
 def _angles(d):
@@ -24,7 +24,7 @@ def _houses(azimuth, slope, count: int, seed: int, low: float, high: float):
     t = azimuth / (2 * np.pi) * count + 0.33 * np.sin(3 * azimuth + seed)
     house, x = rows(t, 1.0)
     house = house % count
-    step = (np.abs(x - 0.5) < 0.28) & (dice(house, 2 + seed + 0 * house) > 0.6)        # some have a smaller top
+    step = (np.abs(x - 0.5) < 0.28) & (dice(house, 2 + seed + 0 * house) > 0.6)  # some have a smaller top
     return house, low + (high - low) * dice(house, seed + 0 * house) + 0.06 * step, x
 
 
@@ -82,7 +82,7 @@ def city(d: np.ndarray) -> np.ndarray:
     green = mix([0.03, 0.09, 0.02], [0.45, 0.62, 0.14], np.clip(leaves * 1.5 - 0.35 + (slope - 0.17) * 3, 0, 1))
     color = where(there & (np.abs(s) < 0.007) & (slope < 0.17), [0.09, 0.06, 0.04], color)
     color = where(there & crown, green, color)
-    color = where((slope < 0.028) & (np.abs(azimuth * 40 % 1 - 0.5) > 0.2), [0.05, 0.09, 0.04], color)      # a hedge
+    color = where((slope < 0.028) & (np.abs(azimuth * 40 % 1 - 0.5) > 0.2), [0.05, 0.09, 0.04], color)  # a hedge
     return where(d[:, 2] < 0, _square(d), color)
 
 
@@ -108,6 +108,7 @@ def _square(d):
 
 
 # ---- By night ----
+
 
 def _lamps(azimuth, slope):
     """Street lamps: light [N, 3] to add, and where their poles are."""
@@ -153,7 +154,7 @@ def _night_front(azimuth, slope):
     color = where(awning, where((x * 9) % 1 < 0.5, pick(dice(shop, 123 + 0 * shop)) * 0.8, [0.75, 0.72, 0.66]), color)
     light, pole = _lamps(azimuth, slope)
     color = where(pole, [0.02, 0.02, 0.02], color) + light
-    for k, span in enumerate((9, 7)):       # strings of coloured bulbs across the street
+    for k, span in enumerate((9, 7)):  # strings of coloured bulbs across the street
         _, x = rows(azimuth / (2 * np.pi) * span, 1.0)
         sag = slope - 1.15 - 0.55 * k - 0.9 * (x - 0.5) ** 2
         bulb, t = rows(azimuth / (2 * np.pi) * 120 / (k + 1), 1.0)

@@ -33,8 +33,19 @@ def dice(*keys):
     return h / 2.0**32
 
 
-PALETTE = np.array([[.70, .08, .05], [.05, .25, .55], [.85, .55, .08], [.08, .40, .22], [.75, .72, .65],
-                    [.35, .10, .40], [.90, .30, .10], [.10, .50, .55], [.12, .12, .14]])
+PALETTE = np.array(
+    [
+        [0.70, 0.08, 0.05],
+        [0.05, 0.25, 0.55],
+        [0.85, 0.55, 0.08],
+        [0.08, 0.40, 0.22],
+        [0.75, 0.72, 0.65],
+        [0.35, 0.10, 0.40],
+        [0.90, 0.30, 0.10],
+        [0.10, 0.50, 0.55],
+        [0.12, 0.12, 0.14],
+    ]
+)
 
 
 def pick(numbers):
@@ -80,8 +91,14 @@ def room(d, half, floor: float, ceiling: float, painters) -> np.ndarray:
         far[:, 2] = np.where(d[:, 2] > 0, ceiling, floor) / d[:, 2]
     p, wall = d * far.min(1, keepdims=True), far.argmin(1)
     x, y, z = p.T
-    sides = [(wall == 0) & (x > 0), (wall == 0) & (x < 0), (wall == 1) & (y > 0), (wall == 1) & (y < 0),
-             (wall == 2) & (z > 0), (wall == 2) & (z < 0)]
+    sides = [
+        (wall == 0) & (x > 0),
+        (wall == 0) & (x < 0),
+        (wall == 1) & (y > 0),
+        (wall == 1) & (y < 0),
+        (wall == 2) & (z > 0),
+        (wall == 2) & (z < 0),
+    ]
     radiance = np.zeros(d.shape)
     for side, painter, u, v in zip(sides, painters, (y, y, x, x, x, x), (z, z, z, z, y, y)):
         radiance[side] = painter(u[side], v[side])

@@ -69,7 +69,7 @@ def _gels(u, v):
     """A white wall under two coloured lights, an umbrella, a door."""
     color = _wall(u, v, [0.42, 0.41, 0.42], [0.24, 0.24, 0.25])
     for x, tint in ((-1.7, [1.5, 0.35, 0.10]), (1.7, [0.10, 0.55, 1.3])):
-        spread = np.exp(-((u - x) / (0.35 + 0.35 * (v + 1.1))) ** 2 * 1.6) * np.exp(-(v + 1.1) / 2.2)
+        spread = np.exp(-(((u - x) / (0.35 + 0.35 * (v + 1.1))) ** 2) * 1.6) * np.exp(-(v + 1.1) / 2.2)
         color = color + spread[..., None] * np.array(tint)
     r, a = np.hypot(u, v - 0.75), np.arctan2(v - 0.75, u)
     rib = np.abs(a * 4 / np.pi - np.round(a * 4 / np.pi)) * r < 0.012

@@ -4,10 +4,11 @@ import numpy as np
 
 from .paint import box, dice, mix, pick, room, rows
 
-FLOOR, CEILING, HALF_X, HALF_Y = -1.3, 2.1, 3.6, 3.0        # the room, metres; the object is at the origin
+FLOOR, CEILING, HALF_X, HALF_Y = -1.3, 2.1, 3.6, 3.0  # the room, metres; the object is at the origin
 
 
 # ---- Walls ----
+
 
 def _window(u, v):
     """A wall with a wide window: sky, a sun behind haze, hills, mullions."""
@@ -52,8 +53,9 @@ def _panels(u, v):
     i2, x2 = rows(u, 0.55 / 4)
     j2, y2 = rows(v - FLOOR + 0.2 * (i % 2), 0.12)
     color = np.where(fine[..., None], pick(dice(i2, j2)), pick(dice(i, j, 2 + 0 * i)))
-    joint = np.where(fine, np.maximum(np.abs(x2 - 0.5), np.abs(y2 - 0.5)) > 0.43,
-                     np.maximum(np.abs(x - 0.5), np.abs(y - 0.5)) > 0.475)
+    joint = np.where(
+        fine, np.maximum(np.abs(x2 - 0.5), np.abs(y2 - 0.5)) > 0.43, np.maximum(np.abs(x - 0.5), np.abs(y - 0.5)) > 0.475
+    )
     color = np.where(joint[..., None], [0.85, 0.85, 0.85], color * 0.9)
     for center, tint in ((-1.65, [3.5, 5.5, 8.0]), (1.65, [8.0, 5.0, 3.0])):
         color = np.where(box(u, v, (center, 0.35), (0.16, 1.45))[..., None], [0.04, 0.04, 0.04], color)

@@ -7,10 +7,10 @@ import numpy as np
 from . import implicit
 from .meshes import Mesh, divide, join, lathe, rounded
 
-CENTER, HALF = np.array([0, 0, -0.07]), np.array([0.69, 0.39, 0.42])    # the housing
-SLOT, SLOT_HALF = 0.155, (0.46, 0.078)              # the slots' distance from the middle, half length, half width
-CAP = 0.53                                          # |x| where the end caps begin
-TRACK = np.array([0.70, 0, 0.0]), np.array([0.07, 0.024, 0.24])     # the lever's slit: middle and half extents
+CENTER, HALF = np.array([0, 0, -0.07]), np.array([0.69, 0.39, 0.42])  # the housing
+SLOT, SLOT_HALF = 0.155, (0.46, 0.078)  # the slots' distance from the middle, half length, half width
+CAP = 0.53  # |x| where the end caps begin
+TRACK = np.array([0.70, 0, 0.0]), np.array([0.07, 0.024, 0.24])  # the lever's slit: middle and half extents
 STEP = 0.0105
 
 
@@ -20,6 +20,7 @@ def _folded(p):
 
 
 # ---- The housing ----
+
 
 def _slots(p):
     return implicit.box(_folded(p) - [0, 0, 0.36], [*SLOT_HALF, 0.45], 0.05)
@@ -32,28 +33,33 @@ def _track(p):
 def _housing(p):
     q = p - CENTER
     shell = implicit.box(q, HALF, 0.16) - 0.03 * (1 - (q[:, 2] / HALF[2]) ** 2)
-    shell += 0.012 * np.exp(-(((np.abs(p[:, 0]) - CAP) / 0.014) ** 2))      # a groove where the caps begin
+    shell += 0.012 * np.exp(-(((np.abs(p[:, 0]) - CAP) / 0.014) ** 2))  # a groove where the caps begin
     return implicit.difference(implicit.difference(shell, _slots(p), 0.03), _track(p), 0.016)
 
 
 @functools.cache
 def _shell() -> dict[str, Mesh]:
     mesh = implicit.surface(_housing, -np.array([0.8, 0.5, 0.6]), [0.8, 0.5, 0.45], STEP)
-    regions = [("hollows", (lambda p: _slots(p) - 0.003,)), ("hollows", (lambda p: _track(p) - 0.003,)),
-               ("caps", (lambda p: CAP - np.abs(p[:, 0]),))]
+    regions = [
+        ("hollows", (lambda p: _slots(p) - 0.003,)),
+        ("hollows", (lambda p: _track(p) - 0.003,)),
+        ("caps", (lambda p: CAP - np.abs(p[:, 0]),)),
+    ]
     return divide(mesh, regions, rest="body")
 
 
 def base() -> Mesh:
     """A plinth with four feet."""
-    plinth = implicit.surface(lambda p: implicit.box(p - [0, 0, -0.485], [0.665, 0.365, 0.05], 0.045),
-                              [-0.7, -0.4, -0.56], [0.7, 0.4, -0.4], 0.02)
+    plinth = implicit.surface(
+        lambda p: implicit.box(p - [0, 0, -0.485], [0.665, 0.365, 0.05], 0.045), [-0.7, -0.4, -0.56], [0.7, 0.4, -0.4], 0.02
+    )
     profile = rounded([[0, -0.50], [0.07, -0.50], [0.055, -0.58], [0, -0.58]], [0, 0.01, 0.02, 0])
     feet = [lathe(profile, np.array([x, y, 0.0]), [0, 0, 1], sides=64) for x in (-0.5, 0.5) for y in (-0.24, 0.24)]
     return join(plinth, *feet)
 
 
 # ---- The slices ----
+
 
 def _outline(p):
     """[N] field of a slice seen from its face."""
@@ -84,6 +90,7 @@ def _slices() -> dict[str, Mesh]:
 
 # ---- What one touches ----
 
+
 def lever() -> Mesh:
     """A handle on an arm that comes out of the slit."""
     arm = lambda p: implicit.capsule(p * [1, 1, 0.6], [0.62, 0, 0.078], [0.80, 0, 0.078], 0.014)
@@ -92,8 +99,10 @@ def lever() -> Mesh:
 
 
 def dial() -> Mesh:
-    profile = rounded([[0, 0.085], [0.062, 0.085], [0.070, 0.03], [0.092, 0.022], [0.092, -0.06], [0, -0.06]],
-                      [0, 0.016, 0.010, 0.010, 0.01, 0])
+    profile = rounded(
+        [[0, 0.085], [0.062, 0.085], [0.070, 0.03], [0.092, 0.022], [0.092, -0.06], [0, -0.06]],
+        [0, 0.016, 0.010, 0.010, 0.01, 0],
+    )
     return lathe(profile, np.array([0.70, 0.19, -0.25]), [1, 0, 0], sides=96)
 
 
@@ -109,6 +118,12 @@ def buttons() -> Mesh:
     return join(*(lathe(profile, np.array([0.70, -0.19, z]), [1, 0, 0], sides=64) for z in (-0.30, -0.19, -0.08)))
 
 
-PARTS = {**{name: lambda name=name: _shell()[name] for name in ("body", "caps", "hollows")},
-         **{name: lambda name=name: _slices()[name] for name in ("crust", "crumb", "browned")},
-         "base": base, "lever": lever, "dial": dial, "pointer": pointer, "buttons": buttons}
+PARTS = {
+    **{name: lambda name=name: _shell()[name] for name in ("body", "caps", "hollows")},
+    **{name: lambda name=name: _slices()[name] for name in ("crust", "crumb", "browned")},
+    "base": base,
+    "lever": lever,
+    "dial": dial,
+    "pointer": pointer,
+    "buttons": buttons,
+}

@@ -81,8 +81,10 @@ def grid(shapes=("sphere",), environments=ENVIRONMENTS, roughness=ROUGHNESS) -> 
         if not 0 <= r <= 1:
             raise UserError(f"roughness is {r:g}: needs a number from 0 to 1")
     materials = [(1.0, c) for c in METALS] + [(0.0, c) for c in DIELECTRICS]
-    return [Case(shape, environment, r, metallic, color)
-            for shape, environment, (metallic, color), r in itertools.product(shapes, environments, materials, roughness)]
+    return [
+        Case(shape, environment, r, metallic, color)
+        for shape, environment, (metallic, color), r in itertools.product(shapes, environments, materials, roughness)
+    ]
 
 
 @dataclass
@@ -159,28 +161,42 @@ class Validator:
 
     def run(self, case: Case) -> Result:
         """The estimates of one case."""
-        light = {"type": "procedural_envmap", "name": case.environment, "resolution": _ENVIRONMENT_ROWS,
-                 "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90)}
+        light = {
+            "type": "procedural_envmap",
+            "name": case.environment,
+            "resolution": _ENVIRONMENT_ROWS,
+            "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90),
+        }
         scene = mi.load_dict({"type": "scene", "light": light} | _shapes(case))
         si, lanes, rays = self._hits(scene)
         n = len(lanes)
         view, normal = si.to_world(si.wi), mi.Vector3f(si.sh_frame.n)
-        surfaces = (normal, view, dr.opaque(mi.Float, case.roughness, n), dr.opaque(mi.Float, case.metallic, n),
-                    mi.Color3f(*(dr.opaque(mi.Float, c, n) for c in case.base_color)))
+        surfaces = (
+            normal,
+            view,
+            dr.opaque(mi.Float, case.roughness, n),
+            dr.opaque(mi.Float, case.metallic, n),
+            mi.Color3f(*(dr.opaque(mi.Float, c, n) for c in case.base_color)),
+        )
         cover = None if case.shape == "sphere" else _Visibility(scene, si)
         environment = Environment.from_emitter(scene.environment())
 
         def sampled(seed):
-            estimator = MonteCarlo(environment.unfiltered(), scene.environment(), DEFAULT_ETA, 2 * self.samples,
-                                   dr.opaque(mi.UInt32, seed))
+            estimator = MonteCarlo(
+                environment.unfiltered(), scene.environment(), DEFAULT_ETA, 2 * self.samples, dr.opaque(mi.UInt32, seed)
+            )
             return _radiance(estimator, case, surfaces, cover)
 
         batches = range(self.seed + 1, self.seed + 1 + BATCHES)
-        return Result(case, self.size, lanes,
-                      Estimate.of([self._path(scene, rays, 2, k) for k in batches]),
-                      Estimate.of([self._path(scene, rays, _DEEP, BATCHES + k) for k in batches]),
-                      Estimate.of([sampled(k) for k in batches]),
-                      _radiance(SplitSum(environment.filtered(), DEFAULT_ETA), case, surfaces, cover))
+        return Result(
+            case,
+            self.size,
+            lanes,
+            Estimate.of([self._path(scene, rays, 2, k) for k in batches]),
+            Estimate.of([self._path(scene, rays, _DEEP, BATCHES + k) for k in batches]),
+            Estimate.of([sampled(k) for k in batches]),
+            _radiance(SplitSum(environment.filtered(), DEFAULT_ETA), case, surfaces, cover),
+        )
 
     def _hits(self, scene):
         """(surface interactions, their pixels [pixels], their rays) of a view of the shape."""
@@ -218,12 +234,19 @@ class _Visibility:
 
 def _shapes(case):
     """The shape of a case for `mi.load_dict`."""
-    bsdf = {"type": "principled", "roughness": case.roughness, "metallic": case.metallic, "eta": DEFAULT_ETA,
-            "base_color": {"type": "rgb", "value": list(case.base_color)}}
+    bsdf = {
+        "type": "principled",
+        "roughness": case.roughness,
+        "metallic": case.metallic,
+        "eta": DEFAULT_ETA,
+        "base_color": {"type": "rgb", "value": list(case.base_color)},
+    }
     if case.shape == "sphere":
         return {"shape": {"type": "sphere", "bsdf": bsdf}}
-    return {part: {"type": "procedural_mesh", "model": case.shape, "part": part, "bsdf": bsdf}
-            for part in targets.parts(case.shape)}
+    return {
+        part: {"type": "procedural_mesh", "model": case.shape, "part": part, "bsdf": bsdf}
+        for part in targets.parts(case.shape)
+    }
 
 
 def _radiance(estimator, case, surfaces, cover):

@@ -50,8 +50,13 @@ def _surface(cosines, roughness, metallic, color):
     n = len(cosines)
     constant = lambda v: dr.opaque(mi.Float, v, n)
     view = mi.Vector3f(mi.Float(np.sqrt(1 - cosines**2)), 0, mi.Float(cosines))
-    return (mi.Vector3f(constant(0), constant(0), constant(1)), view, constant(roughness), constant(metallic),
-            mi.Color3f(*3 * (constant(color),)))
+    return (
+        mi.Vector3f(constant(0), constant(0), constant(1)),
+        view,
+        constant(roughness),
+        constant(metallic),
+        mi.Color3f(*3 * (constant(color),)),
+    )
 
 
 def _furnace(roughness, metallic, color, samples):
@@ -75,6 +80,7 @@ def _furnace(roughness, metallic, color, samples):
 
 def _chi2(roughness) -> float:
     """p-value of the lobe's sampler against its density, for a view at 60°."""
+
     def lanes(n):
         lobe = SpecularLobe(mi.Float(roughness), mi.Float(1), mi.Color3f(1), DEFAULT_ETA)
         return lobe, interaction(mi.Vector3f(0.75**0.5, 0, 0.5) + dr.zeros(mi.Vector3f, n))
@@ -88,8 +94,9 @@ def _chi2(roughness) -> float:
         lobe, si = lanes(dr.width(local))
         return lobe.pdf(si, local)
 
-    test = mi.chi2.ChiSquareTest(mi.chi2.SphericalDomain(), draw, density, sample_dim=2, sample_count=1 << 20, res=101,
-                                 ires=32)
+    test = mi.chi2.ChiSquareTest(
+        mi.chi2.SphericalDomain(), draw, density, sample_dim=2, sample_count=1 << 20, res=101, ires=32
+    )
     test._dump_tables = lambda: None  # it would leave a file in the current folder
     with contextlib.redirect_stdout(None):
         test.run(0.01, 1)
@@ -99,8 +106,10 @@ def _chi2(roughness) -> float:
 def _reciprocity(roughness) -> float:
     """Largest |f(a, b) − f(b, a)| over the largest f, for pairs of directions."""
     rng = np.random.default_rng(0)
-    a, b = (mi.Vector3f(*(mi.Float(c) for c in (v / np.linalg.norm(v, axis=0))))
-            for v in (np.abs(rng.normal(size=(3, 4096))) + [[0], [0], [0.05]] for _ in range(2)))
+    a, b = (
+        mi.Vector3f(*(mi.Float(c) for c in (v / np.linalg.norm(v, axis=0))))
+        for v in (np.abs(rng.normal(size=(3, 4096))) + [[0], [0], [0.05]] for _ in range(2))
+    )
     bsdf = principled(roughness, 1, 0.8, DEFAULT_ETA)
     f = lambda wi, wo: (bsdf.eval(mi.BSDFContext(), interaction(wi), wo).x / wo.z).numpy()
     forth, back = f(a, b), f(b, a)

@@ -1,8 +1,8 @@
 """What `scripts/crossvalidate.py` calls.
 
-    OUT/crossvalidation.html    everything on one page
-    OUT/cases.csv               a row a case
-    OUT/CASE.exr                float maps: path, monte_carlo, split_sum, z
+OUT/crossvalidation.html    everything on one page
+OUT/cases.csv               a row a case
+OUT/CASE.exr                float maps: path, monte_carlo, split_sum, z
 """
 
 import csv
@@ -43,68 +43,107 @@ def crossvalidate(out, cases, validator, quiet=False, checked=(0.1, 0.3, 0.7)) -
     for line in failures:
         print(line, file=sys.stderr)
     equal = sum(r.difference.equal for r in results)
-    print(f"monte_carlo equals path in {equal} of {len(results)} cases; split_sum is off by "
-          f"{np.mean([r.error for r in results]):.2%} in the mean, {max(r.error for r in results):.2%} at most; "
-          f"{sum(c.passed for c in found)} of {len(found)} checks pass\n{out / 'crossvalidation.html'}")
+    print(
+        f"monte_carlo equals path in {equal} of {len(results)} cases; split_sum is off by "
+        f"{np.mean([r.error for r in results]):.2%} in the mean, {max(r.error for r in results):.2%} at most; "
+        f"{sum(c.passed for c in found)} of {len(found)} checks pass\n{out / 'crossvalidation.html'}"
+    )
     return len(failures)
 
 
 def _row(r) -> dict:
     c = r.case
-    return {"shape": c.shape, "environment": c.environment, "material": c.material, "roughness": f"{c.roughness:g}",
-            "pixels": len(r.lanes), "z_passed": f"{r.difference.passed:.4f}", "z_of_sums": f"{r.difference.global_z:.2f}",
-            "split_sum_error": f"{r.error:.4f}", "noise": f"{r.noise:.4f}", "interreflection": f"{r.interreflection:+.4f}",
-            "verdict": "; ".join(r.failures()) or "passes"}
+    return {
+        "shape": c.shape,
+        "environment": c.environment,
+        "material": c.material,
+        "roughness": f"{c.roughness:g}",
+        "pixels": len(r.lanes),
+        "z_passed": f"{r.difference.passed:.4f}",
+        "z_of_sums": f"{r.difference.global_z:.2f}",
+        "split_sum_error": f"{r.error:.4f}",
+        "noise": f"{r.noise:.4f}",
+        "interreflection": f"{r.interreflection:+.4f}",
+        "verdict": "; ".join(r.failures()) or "passes",
+    }
 
 
 def _write_maps(path, r):
     maps = {"path": r.path.mean, "monte_carlo": r.monte_carlo.mean, "split_sum": r.split_sum, "z": r.difference.z}
-    write_exr(path, np.concatenate([r.picture(v) for v in maps.values()], -1),
-              [f"{name}.{channel}" for name in maps for channel in "RGB"])
+    write_exr(
+        path,
+        np.concatenate([r.picture(v) for v in maps.values()], -1),
+        [f"{name}.{channel}" for name in maps for channel in "RGB"],
+    )
 
 
 def _html(results, rows, found) -> str:
-    parts = [html.paragraph(
-        "Mitsuba's path tracer (two segments: direct light) against rgs_deferred's estimators, on Mitsuba's geometry and "
-        "rays. z_passed: the part of all pixels whose difference to monte_carlo is within their standard errors; "
-        "z_of_sums: the difference of sums over all pixels in standard errors; split_sum_error: Σ|difference| / Σ truth, "
-        "of which noise is the truth's own; interreflection: what deeper paths add.")]
+    parts = [
+        html.paragraph(
+            "Mitsuba's path tracer (two segments: direct light) against rgs_deferred's estimators, on Mitsuba's geometry and "
+            "rays. z_passed: the part of all pixels whose difference to monte_carlo is within their standard errors; "
+            "z_of_sums: the difference of sums over all pixels in standard errors; split_sum_error: Σ|difference| / Σ truth, "
+            "of which noise is the truth's own; interreflection: what deeper paths add."
+        )
+    ]
     sphere = [r for r in results if r.case.shape == "sphere"]
     if sphere:
         series = {}
         for r in sphere:
             series.setdefault(r.case.material, {}).setdefault(r.case.roughness, []).append(100 * r.error)
         series = {name: (sorted(values), [np.mean(values[x]) for x in sorted(values)]) for name, values in series.items()}
-        parts += [html.heading("Split-sum's error against roughness, sphere, mean over environments"),
-                  html.curves(series, "roughness", "%", {kind: 100 * b for kind, b in BOUNDS.items()})]
+        parts += [
+            html.heading("Split-sum's error against roughness, sphere, mean over environments"),
+            html.curves(series, "roughness", "%", {kind: 100 * b for kind, b in BOUNDS.items()}),
+        ]
     parts.append(html.heading("Cases"))
-    parts.append(html.table(list(rows[0]), [list(row.values()) for row in rows],
-                            [k for k, row in enumerate(rows) if row["verdict"] != "passes"]))
+    parts.append(
+        html.table(
+            list(rows[0]),
+            [list(row.values()) for row in rows],
+            [k for k, row in enumerate(rows) if row["verdict"] != "passes"],
+        )
+    )
     if any(r.case.shape == "sphere" and r.error > BOUNDS[r.case.kind] for r in results):
-        parts.append(html.paragraph(
-            "Where split_sum is over its bound, what is left is its approximation: three lookups in a filtered environment "
-            "for a lobe that is stretched, and cut off at the horizon, before light with hard edges. Finer levels of the "
-            "filter do not lower it (docs/findings.md). monte_carlo has no such error."))
+        parts.append(
+            html.paragraph(
+                "Where split_sum is over its bound, what is left is its approximation: three lookups in a filtered environment "
+                "for a lobe that is stretched, and cut off at the horizon, before light with hard edges. Finer levels of the "
+                "filter do not lower it (docs/findings.md). monte_carlo has no such error."
+            )
+        )
     parts.append(html.heading("Sampler, reciprocity, energy"))
-    parts.append(html.table(("check", "value", "bound"), [(c.name, f"{c.value:.4g}", f"{c.bound:g}") for c in found],
-                            [k for k, c in enumerate(found) if not c.passed]))
+    parts.append(
+        html.table(
+            ("check", "value", "bound"),
+            [(c.name, f"{c.value:.4g}", f"{c.bound:g}") for c in found],
+            [k for k, c in enumerate(found) if not c.passed],
+        )
+    )
     parts.append(html.heading("Pictures"))
     key = lambda r: (r.case.shape, r.case.environment, r.case.material)
     for (shape, environment, material), group in itertools.groupby(results, key):
         group = list(group)
         columns = [_column(r) for r in group]
         values = ", ".join(f"{r.case.roughness:g}" for r in group)
-        parts.append(html.figure(np.concatenate(columns, 1), f"{shape} in {environment}, {material}; roughness {values} "
-                                 "from left to right. Rows: path, monte_carlo, split_sum; z from −5 (blue) to 5 (red); "
-                                 "split_sum − truth from −0.2 to 0.2", 2))
+        parts.append(
+            html.figure(
+                np.concatenate(columns, 1),
+                f"{shape} in {environment}, {material}; roughness {values} "
+                "from left to right. Rows: path, monte_carlo, split_sum; z from −5 (blue) to 5 (red); "
+                "split_sum − truth from −0.2 to 0.2",
+                2,
+            )
+        )
     return html.page("Cross-validation with Mitsuba's path tracer", *parts)
 
 
 def _column(r):
     """The pictures of a case, one below the other."""
     estimates = [tone_map(r.picture(v)) for v in (r.path.mean, r.monte_carlo.mean, r.split_sum)]
-    return np.concatenate([*estimates, _signed(r.picture(r.difference.z) / 5),
-                           _signed(r.picture(r.split_sum - r.truth) * 5)])
+    return np.concatenate(
+        [*estimates, _signed(r.picture(r.difference.z) / 5), _signed(r.picture(r.split_sum - r.truth) * 5)]
+    )
 
 
 def _signed(values):

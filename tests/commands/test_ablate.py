@@ -56,6 +56,7 @@ def read(out):
 
 # ---- Plan ----
 
+
 def settings(suite, variant):
     scene, captures = suite
     v = ablate.VARIANTS[variant]
@@ -100,9 +101,14 @@ def test_scenes_are_found(tmp_path):
     assert list(jobs.find_scenes(ROOT / "scenes" / "targets")) == ["ball", "car", "coffee", "helmet", "teapot", "toaster"]
 
 
-@pytest.mark.parametrize("options, message", [
-    ({"scenes": ["tree"]}, "no scene 'tree': choose from one, two"), ({"variants": ["ful"]}, "no variant 'ful'"),
-    ({"overrides": ["densty.start=0.1"]}, "did you mean")])
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"scenes": ["tree"]}, "no scene 'tree': choose from one, two"),
+        ({"variants": ["ful"]}, "no variant 'ful'"),
+        ({"overrides": ["densty.start=0.1"]}, "did you mean"),
+    ],
+)
 def test_mistakes(suite, tmp_path, options, message):
     with pytest.raises(UserError, match=message):
         call(suite, tmp_path, **options)
@@ -121,6 +127,7 @@ def test_settings_younger_than_a_fit(suite):
 
 
 # ---- Fits ----
+
 
 def test_goes_on(suite, tmp_path, inside, capsys):
     options = {"scenes": ["one"], "variants": ["baseline", "full"]}
@@ -177,8 +184,22 @@ def test_failures_are_told(suite, tmp_path, inside, monkeypatch, capsys):
 def test_stopped_and_gone_on(suite, tmp_path, monkeypatch):
     """In processes of their own: Ctrl-C, one that is killed, and the same command again."""
     scene, captures = suite
-    command = [captures, "--scenes", "one", "--variants", "baseline", "--out", tmp_path / "out", "--quiet", "--set",
-               "start.surfels=200", "--set", "stages=[{views: 2}]", "--set", "checkpoint_seconds=0"]
+    command = [
+        captures,
+        "--scenes",
+        "one",
+        "--variants",
+        "baseline",
+        "--out",
+        tmp_path / "out",
+        "--quiet",
+        "--set",
+        "start.surfels=200",
+        "--set",
+        "stages=[{views: 2}]",
+        "--set",
+        "checkpoint_seconds=0",
+    ]
     monkeypatch.chdir(tmp_path)
     process = start_script("ablate.py", *command, "--set", "iterations=1000000")
     run = tmp_path / "out" / "one" / "baseline"
@@ -220,8 +241,11 @@ def no_luck():
 
 def test_apart(capfd):
     assert subprocesses.apart(divmod, 7, 2) == (3, 1)
-    for function, message in ((kill_myself, "SIGKILL, perhaps for want of memory"), (no_luck, "^no luck$"),
-                              (crash, "ZeroDivisionError: division by zero")):
+    for function, message in (
+        (kill_myself, "SIGKILL, perhaps for want of memory"),
+        (no_luck, "^no luck$"),
+        (crash, "ZeroDivisionError: division by zero"),
+    ):
         with pytest.raises(UserError, match=message):
             subprocesses.apart(function)
     assert "in crash" in capfd.readouterr().err  # a bug shows where it is
@@ -260,18 +284,32 @@ def test_saves_when_its_parent_ends(tmp_path, number):
 
 # ---- Tables ----
 
+
 def row(scene, variant, seed=0, status="finished", **figures):
-    return {"scene": scene, "variant": variant, "seed": seed, "status": status, "error": None,
-            **dict.fromkeys((*comparison.FIGURES, *comparison.DETAILS)), **figures}
+    return {
+        "scene": scene,
+        "variant": variant,
+        "seed": seed,
+        "status": status,
+        "error": None,
+        **dict.fromkeys((*comparison.FIGURES, *comparison.DETAILS)),
+        **figures,
+    }
 
 
 def test_means():
     """Scenes weigh alike however many seeds they have; differences are of what both variants have."""
-    rows = [row("a", "baseline", 0, psnr=20.0, normal_mae_deg=8.0), row("a", "baseline", 1, psnr=22.0, normal_mae_deg=6.0),
-            row("b", "baseline", 0, psnr=30.0), row("c", "baseline", 0, psnr=40.0, normal_mae_deg=2.0),
-            row("a", "full", 0, psnr=23.0, normal_mae_deg=5.0), row("a", "full", 1, psnr=26.0, normal_mae_deg=4.0),
-            row("b", "full", 0, psnr=31.0, normal_mae_deg=1.0), row("c", "full", 0, "failed"),
-            row("a", "no-depth", 0, psnr=22.0, normal_mae_deg=7.0)]
+    rows = [
+        row("a", "baseline", 0, psnr=20.0, normal_mae_deg=8.0),
+        row("a", "baseline", 1, psnr=22.0, normal_mae_deg=6.0),
+        row("b", "baseline", 0, psnr=30.0),
+        row("c", "baseline", 0, psnr=40.0, normal_mae_deg=2.0),
+        row("a", "full", 0, psnr=23.0, normal_mae_deg=5.0),
+        row("a", "full", 1, psnr=26.0, normal_mae_deg=4.0),
+        row("b", "full", 0, psnr=31.0, normal_mae_deg=1.0),
+        row("c", "full", 0, "failed"),
+        row("a", "no-depth", 0, psnr=22.0, normal_mae_deg=7.0),
+    ]
     table = comparison.means(rows, ablate.VARIANTS)
     assert list(table) == ["baseline", "full", "no-depth"]
     assert table["baseline"]["scenes"] == 3 and table["baseline"]["psnr"] == pytest.approx((21 + 30 + 40) / 3)
@@ -287,8 +325,25 @@ def test_means():
     text = comparison.mean_tables(table, ablate.VARIANTS, ablate.PAPER)
     cells = [[cell.strip() for cell in line.split("|")] for line in text.splitlines() if line]
     lines = {line[1]: line[2:-1] for line in cells}
-    assert lines["full: + CSCR + RD"] == ["2", "27.75", "", "", "2.75°", "", "", "", "+2.25 (+2.00, +4.00)", "", "",
-                                          "-2.50° (-3.00°, -2.00°)", "35.38", "+2.09", "0.976", "2.04°", "100 000"]
+    assert lines["full: + CSCR + RD"] == [
+        "2",
+        "27.75",
+        "",
+        "",
+        "2.75°",
+        "",
+        "",
+        "",
+        "+2.25 (+2.00, +4.00)",
+        "",
+        "",
+        "-2.50° (-3.00°, -2.00°)",
+        "35.38",
+        "+2.09",
+        "0.976",
+        "2.04°",
+        "100 000",
+    ]
     assert lines["deferred 2DGS"][-5:] == ["33.29", "", "0.967", "", "1 400 000"]
     assert lines["full, no depth prior"] == ["1", "22.00", "", "", "7.00°", "", "", "", "-1.00", "", "", "+2.00°"]
     assert len({len(line) for line in text.split("\n\n")[0].splitlines()}) == 1  # aligned
@@ -306,8 +361,11 @@ def test_table_files(suite, tmp_path):
     with open(tmp_path / "ablation.csv", newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [tuple(r[name] for name in ("scene", "variant", "psnr", "error")) for r in rows] == [
-        ("one", "baseline", "", "an, error"), ("one", "rd", "2.5", ""),
-        ("two", "baseline", "3.5", ""), ("two", "rd", "4.5", "")]
+        ("one", "baseline", "", "an, error"),
+        ("one", "rd", "2.5", ""),
+        ("two", "baseline", "3.5", ""),
+        ("two", "rd", "4.5", ""),
+    ]
     told = read(tmp_path)
     assert told["means"]["rd"]["psnr"] == 3.5 and told["means"]["rd"]["difference"]["psnr"] == 1
     text = (tmp_path / "ablation.md").read_text()

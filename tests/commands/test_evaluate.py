@@ -65,10 +65,15 @@ def test_same_figures(inputs, copy):
     assert_same(evaluate.reevaluate(copy, inputs[1], quiet=True), before)  # again, and with the folder given
 
 
-@pytest.mark.parametrize("overrides, options", [
-    (["monte_carlo_start=0"], {"xml": 'type="rgs_deferred"><string name="specular" value="monte_carlo"/>'}),
-    (["shader=mlp"], {"variables": {"diffuse": "lit"}}),
-    (["background=0.25", "sh_start=0", "indirect=none"], {}), (["specular_start=1"], {})])
+@pytest.mark.parametrize(
+    "overrides, options",
+    [
+        (["monte_carlo_start=0"], {"xml": 'type="rgs_deferred"><string name="specular" value="monte_carlo"/>'}),
+        (["shader=mlp"], {"variables": {"diffuse": "lit"}}),
+        (["background=0.25", "sh_start=0", "indirect=none"], {}),
+        (["specular_start=1"], {}),
+    ],
+)
 def test_whatever_the_shading(inputs, tmp_path, overrides, options):
     scene, data = inputs
     other = tmp_path / "other.xml"
@@ -160,18 +165,22 @@ def test_other_photographs(inputs, copy, tmp_path, harm):
     assert (copy / "metrics.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("damage, message", [
-    (lambda run: (run / "metrics.json").unlink(), "metrics.json: missing, damaged"),
-    (lambda run: (run / "metrics.json").write_text("[1, 2]"), "not of a run"),
-    (lambda run: (run / "metrics.json").write_text("{"), "damaged"),
-    (lambda run: change(run, train_seconds="long"), "'train_seconds' is not what a fit writes"),
-    (lambda run: change(run, settings={"background": "sky"}), "no background"),
-    (lambda run: change(run, settings={"background": 7}), "no background"),
-    (lambda run: change(run, photographs=None), "does not say where the photographs are: give their folder with --data"),
-    (lambda run: change(run, photographs="/nowhere"), "'/nowhere' does not exist: give a capture's folder with --data"),
-    (lambda run: (run / "scene.xml").unlink(), "no scene at"),
-    (lambda run: (run / "object.ply").write_bytes(b"ply"), "object.ply: "),
-    (lambda run: (run / "curves.csv").write_text("a,b\nc,d\n"), "curves.csv: damaged")])
+@pytest.mark.parametrize(
+    "damage, message",
+    [
+        (lambda run: (run / "metrics.json").unlink(), "metrics.json: missing, damaged"),
+        (lambda run: (run / "metrics.json").write_text("[1, 2]"), "not of a run"),
+        (lambda run: (run / "metrics.json").write_text("{"), "damaged"),
+        (lambda run: change(run, train_seconds="long"), "'train_seconds' is not what a fit writes"),
+        (lambda run: change(run, settings={"background": "sky"}), "no background"),
+        (lambda run: change(run, settings={"background": 7}), "no background"),
+        (lambda run: change(run, photographs=None), "does not say where the photographs are: give their folder with --data"),
+        (lambda run: change(run, photographs="/nowhere"), "'/nowhere' does not exist: give a capture's folder with --data"),
+        (lambda run: (run / "scene.xml").unlink(), "no scene at"),
+        (lambda run: (run / "object.ply").write_bytes(b"ply"), "object.ply: "),
+        (lambda run: (run / "curves.csv").write_text("a,b\nc,d\n"), "curves.csv: damaged"),
+    ],
+)
 def test_damaged_runs(copy, damage, message):
     damage(copy)
     with pytest.raises(UserError, match=message) as caught:

@@ -14,8 +14,7 @@ from rgs_mi.fit.trainer import Fit
 
 from runs import PATIENCE, SMALL, assert_renders_as_written, start_script, wait_for
 
-SHOWN = ("psnr", "ssim", "lpips", "normal_mae_deg", "surfels", "iterations", "train_seconds", "render_fps",
-         "peak_rss_mb")
+SHOWN = ("psnr", "ssim", "lpips", "normal_mae_deg", "surfels", "iterations", "train_seconds", "render_fps", "peak_rss_mb")
 
 
 @pytest.fixture(scope="module")
@@ -51,16 +50,18 @@ def test_files(run):
         assert (run / name).stat().st_size > 0
     maps = mi.Bitmap(str(run / "test" / "r_0_gbuffer.exr"))
     names = [field.name for field in maps.struct_()]
-    normal, alpha = (np.array(maps)[..., [names.index(n) for n in pick]]
-                     for pick in (["normal.X", "normal.Y", "normal.Z"], ["alpha.Y"]))
+    normal, alpha = (
+        np.array(maps)[..., [names.index(n) for n in pick]] for pick in (["normal.X", "normal.Y", "normal.Z"], ["alpha.Y"])
+    )
     np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), alpha[..., 0], atol=1e-4)
     assert not [p for p in run.rglob("*.tmp")]
 
 
 def test_exported_scene_renders_the_same(run):
     scene = mi.load_file(str(run / "scene.xml"))
-    np.testing.assert_array_equal(np.array(mi.traverse(scene)["environment.data"])[:, 1:-1],
-                                  np.array(mi.Bitmap(str(run / "environment.exr"))))
+    np.testing.assert_array_equal(
+        np.array(mi.traverse(scene)["environment.data"])[:, 1:-1], np.array(mi.Bitmap(str(run / "environment.exr")))
+    )
     assert len(scene.sensors()) == 3
     assert_renders_as_written(scene, run)
 
@@ -79,11 +80,15 @@ def test_indirect_light_is_exported(inputs, tmp_path):
     assert_renders_as_written(scene, folder)
 
 
-@pytest.mark.parametrize("old, new", [
-    ('type="rgs_deferred">', 'type="rgs_deferred"><string name="specular" value="none"/>'),
-    ('type="rgs_deferred">', 'type="rgs_deferred"><string name="specular" value="monte_carlo"/>'),
-    ('<default name="diffuse" value="radiance"/>', '<default name="diffuse" value="lit"/>'),
-    ('<bsdf type="principled" id="material"/>', '<bsdf type="principled"><float name="eta" value="2.5"/></bsdf>')])
+@pytest.mark.parametrize(
+    "old, new",
+    [
+        ('type="rgs_deferred">', 'type="rgs_deferred"><string name="specular" value="none"/>'),
+        ('type="rgs_deferred">', 'type="rgs_deferred"><string name="specular" value="monte_carlo"/>'),
+        ('<default name="diffuse" value="radiance"/>', '<default name="diffuse" value="lit"/>'),
+        ('<bsdf type="principled" id="material"/>', '<bsdf type="principled"><float name="eta" value="2.5"/></bsdf>'),
+    ],
+)
 def test_shading_is_the_scenes(inputs, tmp_path, old, new):
     scene, data = inputs
     other = tmp_path / "other.xml"
@@ -102,9 +107,27 @@ def test_photographs_without_masks(inputs, tmp_path):
         white = Image.new("RGBA", Image.open(path).size, "white")
         white.alpha_composite(Image.open(path))
         white.convert("RGB").save(tmp_path / path.parent.name / path.name)
-    process = start_script("optimize.py", scene, "--data", tmp_path, "--out", tmp_path / "run", "--quiet",
-                           *(word for setting in [*SMALL, "iterations=30", "density.interval=10", "density.start=0",
-                                                  "sh_start=0.2", "start.surroundings=100"] for word in ("--set", setting)))
+    process = start_script(
+        "optimize.py",
+        scene,
+        "--data",
+        tmp_path,
+        "--out",
+        tmp_path / "run",
+        "--quiet",
+        *(
+            word
+            for setting in [
+                *SMALL,
+                "iterations=30",
+                "density.interval=10",
+                "density.start=0",
+                "sh_start=0.2",
+                "start.surroundings=100",
+            ]
+            for word in ("--set", setting)
+        ),
+    )
     _, error = process.communicate(timeout=PATIENCE)
     assert process.returncode == 0 and error == "", error
     figures = metrics(tmp_path / "run")
@@ -200,8 +223,20 @@ def test_no_test_views(inputs, tmp_path):
 
 def test_interrupt(inputs, tmp_path):
     scene, data = inputs
-    process = start_script("optimize.py", scene, "--data", data, "--out", tmp_path, "--set", "iterations=1000000",
-                           "--set", "start.surfels=300", "--set", "checkpoint_seconds=0")
+    process = start_script(
+        "optimize.py",
+        scene,
+        "--data",
+        data,
+        "--out",
+        tmp_path,
+        "--set",
+        "iterations=1000000",
+        "--set",
+        "start.surfels=300",
+        "--set",
+        "checkpoint_seconds=0",
+    )
     wait_for(lambda: any((tmp_path / "checkpoints").glob("step_*[1-9].npz")), process)
     process.send_signal(signal.SIGINT)
     out, error = process.communicate(timeout=PATIENCE)
@@ -225,8 +260,14 @@ def test_mistakes(inputs, tmp_path):
         "malformed YAML": [scene, "--data", data, "--config", write("bad.yaml", "density: [1, ")],
         "did you mean": [scene, "--data", data, "--set", "densty.start=0.1"],
         "'flat' is a OrthographicCamera": [write("flat.xml", sensor), "--data", data],
-        "integrator is a": [write("path.xml", scene.read_text().replace("rgs_deferred", "path").replace(
-            '<string name="diffuse" value="$diffuse"/>', "")), "--data", data],
+        "integrator is a": [
+            write(
+                "path.xml",
+                scene.read_text().replace("rgs_deferred", "path").replace('<string name="diffuse" value="$diffuse"/>', ""),
+            ),
+            "--data",
+            data,
+        ],
         "write name=value": [scene, "--data", data, "-D", "width"],
         "can't be written": [scene, "--data", data, "--out", scene / "run"],
     }

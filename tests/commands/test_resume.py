@@ -57,5 +57,8 @@ if __name__ == "__main__":
 
     rgs_mi.set_variant()
     with tempfile.TemporaryDirectory() as temporary:
-        print("undisturbed {:.2f} dB, killed {:.2f} dB, {} of the kills hit".format(
-            *kill_and_resume(Path(temporary), int(sys.argv[1]))))
+        print(
+            "undisturbed {:.2f} dB, killed {:.2f} dB, {} of the kills hit".format(
+                *kill_and_resume(Path(temporary), int(sys.argv[1]))
+            )
+        )

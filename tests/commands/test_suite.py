@@ -60,6 +60,7 @@ def read(out):
 
 # ---- Scenes ----
 
+
 def test_captures_of_all_layouts_are_found(captures, tmp_path):
     for name, write in (("a", write_colmap), ("b", write_nerfstudio), ("c", write_nero)):
         (tmp_path / name).mkdir()
@@ -78,9 +79,16 @@ def test_no_scenes(tmp_path, root):
         jobs.find_scenes(tmp_path / root)
 
 
-@pytest.mark.parametrize("options, message", [
-    ({"scenes": ["tree"]}, "no scene 'tree': choose from car, helmet"), ({"config": "quick"}, "no preset 'quick'"),
-    ({"overrides": ["densty.start=0.1"]}, "did you mean"), ({"workers": 0}, "at least 1"), ({"minutes": -1}, "between")])
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"scenes": ["tree"]}, "no scene 'tree': choose from car, helmet"),
+        ({"config": "quick"}, "no preset 'quick'"),
+        ({"overrides": ["densty.start=0.1"]}, "did you mean"),
+        ({"workers": 0}, "at least 1"),
+        ({"minutes": -1}, "between"),
+    ],
+)
 def test_mistakes(captures, tmp_path, options, message):
     with pytest.raises(UserError, match=message):
         call(captures, tmp_path / "out", **options)
@@ -88,6 +96,7 @@ def test_mistakes(captures, tmp_path, options, message):
 
 
 # ---- Fits ----
+
 
 def test_goes_on(captures, tmp_path, inside, capsys):
     out = tmp_path / "out"
@@ -99,8 +108,10 @@ def test_goes_on(captures, tmp_path, inside, capsys):
     metrics = json.loads((out / "car" / "metrics.json").read_text())
     assert first["runs"][0]["scene"] == "car"
     assert all(first["runs"][0][name] == metrics[name] for name in (*comparison.FIGURES, *comparison.DETAILS))
-    assert first["means"]["Shiny Blender"]["psnr"] == pytest.approx(
-        sum(r["psnr"] for r in first["runs"]) / 2) and first["means"]["Shiny Blender"]["of"] == 6
+    assert (
+        first["means"]["Shiny Blender"]["psnr"] == pytest.approx(sum(r["psnr"] for r in first["runs"]) / 2)
+        and first["means"]["Shiny Blender"]["of"] == 6
+    )
 
     text = capsys.readouterr().out
     (out / "suite.md").unlink()
@@ -140,8 +151,23 @@ def test_failures_are_told(captures, tmp_path, inside, capsys):
 
 def test_stopped_and_gone_on(captures, tmp_path, monkeypatch):
     """Two at a time in processes of their own: Ctrl-C saves both, and the same command goes on."""
-    command = ["suite", captures[1], "--out", tmp_path / "out", "--quiet", "--workers", "2", "--set", "start.surfels=200",
-               "--set", "stages=[{views: 2}]", "--set", "checkpoint_seconds=0", "--set", "density.stop=0"]
+    command = [
+        "suite",
+        captures[1],
+        "--out",
+        tmp_path / "out",
+        "--quiet",
+        "--workers",
+        "2",
+        "--set",
+        "start.surfels=200",
+        "--set",
+        "stages=[{views: 2}]",
+        "--set",
+        "checkpoint_seconds=0",
+        "--set",
+        "density.stop=0",
+    ]
     monkeypatch.chdir(tmp_path)
     process = start_script("benchmark.py", *command, "--set", "iterations=1000000")
     runs = [tmp_path / "out" / name for name in ("car", "helmet")]
@@ -176,6 +202,7 @@ def test_workers(monkeypatch):
 
 # ---- Tables ----
 
+
 def test_data_sets_by_name():
     assert published.by_data_set(["ball", "teapot", "helmet"]) == {"Shiny Blender": ["ball", "helmet", "teapot"]}
     assert published.by_data_set(["cat_blender", "luyu", "teapot"])["Glossy Synthetic"] == ["cat_blender", "luyu", "teapot"]
@@ -185,33 +212,68 @@ def test_data_sets_by_name():
 
 def test_every_row_of_the_paper_fits_its_table():
     for title, (data_sets, figures) in published.TABLES.items():
-        assert all(len(rows) == len(data_sets) and all(len(row) == len(figures) for row in rows)
-                   for rows in published.PAPER[title].values())
+        assert all(
+            len(rows) == len(data_sets) and all(len(row) == len(figures) for row in rows)
+            for rows in published.PAPER[title].values()
+        )
 
 
 def row(scene, status="finished", **figures):
-    return {"scene": scene, "variant": "fast", "seed": 0, "status": status, "error": None,
-            **dict.fromkeys((*comparison.FIGURES, *comparison.DETAILS)), **figures}
+    return {
+        "scene": scene,
+        "variant": "fast",
+        "seed": 0,
+        "status": status,
+        "error": None,
+        **dict.fromkeys((*comparison.FIGURES, *comparison.DETAILS)),
+        **figures,
+    }
 
 
 def test_tables():
-    ours = published.means([
-        row("ball", psnr=30.0, ssim=0.9, surfels=40_000, train_seconds=600.0, render_fps=20.0, peak_rss_mb=900.0,
-            normal_mae_deg=3.0), row("car", psnr=32.0, ssim=0.92, normal_mae_deg=4.0), row("toaster", "failed"),
-        row("lego", psnr=27.0), row("bottle", psnr=1.0)], ["ball", "car", "toaster", "lego", "bottle", "sedan"])
+    ours = published.means(
+        [
+            row(
+                "ball",
+                psnr=30.0,
+                ssim=0.9,
+                surfels=40_000,
+                train_seconds=600.0,
+                render_fps=20.0,
+                peak_rss_mb=900.0,
+                normal_mae_deg=3.0,
+            ),
+            row("car", psnr=32.0, ssim=0.92, normal_mae_deg=4.0),
+            row("toaster", "failed"),
+            row("lego", psnr=27.0),
+            row("bottle", psnr=1.0),
+        ],
+        ["ball", "car", "toaster", "lego", "bottle", "sedan"],
+    )
     assert list(ours) == ["Shiny Blender", "NeRF Synthetic"] and ours["Shiny Blender"]["psnr"] == 31
     sections = published.tables(ours)
-    assert [s for s in sections if s.startswith("## ")] == ["## Reflective objects", "## NeRF Synthetic",
-                                                            "## Normals, Shiny Blender", "## Budget, Shiny Blender"]
+    assert [s for s in sections if s.startswith("## ")] == [
+        "## Reflective objects",
+        "## NeRF Synthetic",
+        "## Normals, Shiny Blender",
+        "## Budget, Shiny Blender",
+    ]
     lines = [[c.strip() for c in line.split("|")[1:-1]] for line in "\n".join(sections).splitlines() if "|" in line]
     assert lines[0] == ["", "Shiny Blender: PSNR", "Shiny Blender: SSIM", "Shiny Blender: LPIPS"]
     of = [line[1:] for line in lines if line[0] == "RGS, the paper"]
-    assert of == [["35.38", "0.976", "0.050"], ["33.51", "0.968", "0.028"], ["2.04°", "0.954", "0.051"],
-                  ["100 000", "180", "146", "", "35.38"]]
+    assert of == [
+        ["35.38", "0.976", "0.050"],
+        ["33.51", "0.968", "0.028"],
+        ["2.04°", "0.954", "0.051"],
+        ["100 000", "180", "146", "", "35.38"],
+    ]
     mine = [line for line in lines if line[0].startswith("this run")]
-    assert mine == [["this run, scenes 2 of 6", "31.00", "0.910", ""], ["this run, scenes 1 of 8", "27.00", "", ""],
-                    ["this run, scenes 2 of 6", "3.50°", "", ""],
-                    ["this run, scenes 2 of 6", "40 000", "10", "20", "900", "31.00"]]
+    assert mine == [
+        ["this run, scenes 2 of 6", "31.00", "0.910", ""],
+        ["this run, scenes 1 of 8", "27.00", "", ""],
+        ["this run, scenes 2 of 6", "3.50°", "", ""],
+        ["this run, scenes 2 of 6", "40 000", "10", "20", "900", "31.00"],
+    ]
     assert published.tables(published.means([row("bottle", psnr=1.0)], ["bottle"])) == []
     lone = [row("teapot", psnr=30.0)]  # of the data set that the others of the suite are of
     assert list(published.means(lone, ["teapot", "ball"])) == ["Shiny Blender"]

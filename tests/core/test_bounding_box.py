@@ -88,8 +88,9 @@ def test_in_scenes():
     shape = {"type": "surfels"} | {name: getattr(surfels, name) for name in CHANNELS}
     sensor = mi.load_dict(orbit_camera(0.3).to_sensor_dict())
     scene = mi.load_dict({"type": "scene", "object": shape, "light": {"type": "constant"}})
-    image = lambda kind, **more: np.array(mi.render(scene, sensor=sensor, spp=4, integrator=mi.load_dict(
-        {"type": kind, "hide_emitters": True, **more})))
+    image = lambda kind, **more: np.array(
+        mi.render(scene, sensor=sensor, spp=4, integrator=mi.load_dict({"type": kind, "hide_emitters": True, **more}))
+    )
     everywhere, half = image("rgs_deferred"), image("rgs_deferred", box=str(BOX))
     assert 0.1 < (abs(everywhere - half).max(-1) > 0.01).mean() < 0.8 * (everywhere.max(-1) > 0).mean()
     np.testing.assert_array_equal(half, image("rgs_deferred", box="-2,-2,-2, 2,0,2"))
@@ -112,6 +113,7 @@ def test_far_surfels_may_be_large():
     positions = np.array([[0.0, 0, 0], [40, 0, 0], [0, 0.5, 0]], np.float32)
     spacing = np.array([0.1, 3.0, 3.0], np.float32)
     colors, light = np.full((3, 3), 0.5, np.float32), np.ones((4, 8, 3), np.float32)
+
     def left(extent):
         model = Model.start(positions, None, colors, spacing, light, np.eye(3), 1)
         for name in model.optimizer.keys():
@@ -121,5 +123,6 @@ def test_far_surfels_may_be_large():
         gradients.add(dr.zeros(mi.Vector2f, 3), dr.full(mi.Bool, True, 3), (100, 100))
         densify(model, gradients, extent, Density(), np.random.default_rng(0), 10)
         return model.numpy("centers")
+
     np.testing.assert_array_equal(left(1.0), positions[:1])
     np.testing.assert_array_equal(left(np.array([1.0, 40.0, 1.0])), positions[:2])

@@ -26,5 +26,7 @@ def test_errors(capsys):
 def test_warnings_are_one_line_inside_a_command_only(capsys):
     before = warnings.showwarning
     assert outcome(lambda: warnings.warn("3 views\n left out", stacklevel=1), capsys) == (
-        None, "warning: 3 views left out\n")
+        None,
+        "warning: 3 views left out\n",
+    )
     assert warnings.showwarning is before

@@ -32,7 +32,8 @@ def test_plain(clock, capsys, monkeypatch):
     assert out == "" and "\x1b" not in err and "\r" not in err
     assert err.splitlines() == [
         f"fitting {n}% · PSNR 29.81 · 15 230 surfels · 96 ms/step · 200 px · {left} left"
-        for n, left in ((10, "1:30"), (20, "1:20"), (25, "1:15"))]
+        for n, left in ((10, "1:30"), (20, "1:20"), (25, "1:15"))
+    ]
 
 
 def test_budget_and_other_fields(clock, capsys):

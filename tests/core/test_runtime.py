@@ -18,8 +18,9 @@ def libraries(monkeypatch, tmp_path):
     def install(versions):
         paths = {tmp_path / name: version for name, version in versions.items()}
         monkeypatch.setattr(runtime, "_candidates", lambda: iter(paths))
-        monkeypatch.setattr(runtime, "llvm_version", lambda path: next(
-            (v for p, v in paths.items() if str(p) == str(path)), None))
+        monkeypatch.setattr(
+            runtime, "llvm_version", lambda path: next((v for p, v in paths.items() if str(p) == str(path)), None)
+        )
         return paths
 
     return install
@@ -64,9 +65,11 @@ def test_a_wrong_library_ends_a_script_in_one_line(tmp_path):
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="needs a way to take cores away")
 def test_one_core_reads_and_writes_exr_files(tmp_path):
-    code = ("import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
-            "import rgs_mi; rgs_mi.set_variant('llvm_ad_rgb')\n"
-            f"import mitsuba as mi, numpy as np; mi.Bitmap(np.ones((512, 512, 3), np.float32)).write(r'{tmp_path}/a.exr')\n"
-            f"print(np.array(mi.Bitmap(r'{tmp_path}/a.exr')).mean())")
+    code = (
+        "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        "import rgs_mi; rgs_mi.set_variant('llvm_ad_rgb')\n"
+        f"import mitsuba as mi, numpy as np; mi.Bitmap(np.ones((512, 512, 3), np.float32)).write(r'{tmp_path}/a.exr')\n"
+        f"print(np.array(mi.Bitmap(r'{tmp_path}/a.exr')).mean())"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "1.0", done.stderr

@@ -56,6 +56,7 @@ def only(root):
 
 # ---- What comes out ----
 
+
 def test_loads_both_splits(tmp_path):
     write(tmp_path)
     write(tmp_path, [{"file_path": "train/a.png", "transform_matrix": POSE}], "test")
@@ -90,9 +91,17 @@ def test_intrinsics_of_file_and_frame(tmp_path):
 
 def test_images_of_other_kinds(tmp_path):
     grey16 = (np.arange(16 * 24, dtype=np.uint16) * 170).reshape(16, 24)
-    write(tmp_path, [frame(n) for n in ("rgb", "grey", "photo", "small", "opaque")], images={
-        "rgb.png": disc()[..., :3], "grey.png": grey16, "photo.jpg": disc()[..., :3], "small.png": disc()[:8, :9],
-        "opaque.png": np.full((16, 24, 4), 255, np.uint8)})
+    write(
+        tmp_path,
+        [frame(n) for n in ("rgb", "grey", "photo", "small", "opaque")],
+        images={
+            "rgb.png": disc()[..., :3],
+            "grey.png": grey16,
+            "photo.jpg": disc()[..., :3],
+            "small.png": disc()[:8, :9],
+            "opaque.png": np.full((16, 24, 4), 255, np.uint8),
+        },
+    )
     rgb, grey, photo, small, opaque = load_dataset(tmp_path).train
     assert not any(v.masked for v in (rgb, grey, photo, opaque)) and small.masked
     assert (rgb.pixels[..., 3] == 255).all() and photo.path.suffix == ".jpg"
@@ -101,11 +110,11 @@ def test_images_of_other_kinds(tmp_path):
 
 
 def test_16_bit_colour(tmp_path):
-    rows = b"".join(b"\0" + struct.pack(">12H", *[0x1234, 0x8000, 0xffff, 0xffff] * 3) for _ in range(2))
+    rows = b"".join(b"\0" + struct.pack(">12H", *[0x1234, 0x8000, 0xFFFF, 0xFFFF] * 3) for _ in range(2))
     png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">IIBBBBB", 3, 2, 16, 6, 0, 0, 0))
     write(tmp_path, [frame("c")])
     (tmp_path / "train/c.png").write_bytes(png + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b""))
-    np.testing.assert_array_equal(only(tmp_path).pixels, np.full((2, 3, 4), [0x12, 0x80, 0xff, 0xff]))
+    np.testing.assert_array_equal(only(tmp_path).pixels, np.full((2, 3, 4), [0x12, 0x80, 0xFF, 0xFF]))
 
 
 def test_exr_is_linear_with_straight_alpha(tmp_path):
@@ -161,9 +170,18 @@ def test_clamped_normals_are_used_only_where_nothing_was_lost(tmp_path):
 def test_alpha_beside_the_photograph(tmp_path):
     """Shiny Blender's companions: an alpha counts where the photograph has none, a disparity never."""
     alpha = disc()[..., 3]
-    write(tmp_path, [frame("a"), frame("b"), frame("c")], images={
-        "a.png": disc()[..., :3], "a_alpha.png": alpha // 2, "b.png": disc(), "b_alpha.png": 255 - alpha,
-        "c.png": np.dstack([disc()[..., :3], np.full((16, 24), 255, np.uint8)]), "c_alpha.png": np.dstack([alpha] * 3)})
+    write(
+        tmp_path,
+        [frame("a"), frame("b"), frame("c")],
+        images={
+            "a.png": disc()[..., :3],
+            "a_alpha.png": alpha // 2,
+            "b.png": disc(),
+            "b_alpha.png": 255 - alpha,
+            "c.png": np.dstack([disc()[..., :3], np.full((16, 24), 255, np.uint8)]),
+            "c_alpha.png": np.dstack([alpha] * 3),
+        },
+    )
     (tmp_path / "train/a_disp.tiff").write_bytes(b"never read")
     a, b, c = load_dataset(tmp_path).train
     np.testing.assert_array_equal(a.pixels, np.dstack([disc()[..., :3], alpha // 2]))
@@ -180,6 +198,7 @@ def test_alpha_beside_the_photograph(tmp_path):
 
 # ---- What goes wrong ----
 
+
 def test_folders(tmp_path):
     with pytest.raises(UserError, match="nowhere' does not exist"):
         load_dataset(tmp_path / "nowhere")
@@ -189,19 +208,22 @@ def test_folders(tmp_path):
         blender.load(tmp_path)
 
 
-@pytest.mark.parametrize("text, message", [
-    (b'{"frames": [\n  1,, 2]}', "line 2, column 5"),
-    (b"\xff\xfe\xfa", "not a JSON text file"),
-    (b'{"frames": [' + b"9" * 5000 + b"]}", "not a JSON text file"),
-    (b"[" * 100000, "not a JSON text file|malformed JSON"),
-    (b"[]", "outermost value must be an object"),
-    (b"{}", '"frames" is missing'),
-    (b'{"frames": 3}', '"frames" is missing or not a list'),
-    (b'{"frames": []}', "empty"),
-    (b'{"frames": [5]}', "frame 0 is not an object"),
-    (b'{"frames": [{"file_path": 3}]}', 'frame 0: "file_path"'),
-    (b'{"frames": [{"file_path": "./"}]}', 'frame 0: "file_path"'),
-])
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        (b'{"frames": [\n  1,, 2]}', "line 2, column 5"),
+        (b"\xff\xfe\xfa", "not a JSON text file"),
+        (b'{"frames": [' + b"9" * 5000 + b"]}", "not a JSON text file"),
+        (b"[" * 100000, "not a JSON text file|malformed JSON"),
+        (b"[]", "outermost value must be an object"),
+        (b"{}", '"frames" is missing'),
+        (b'{"frames": 3}', '"frames" is missing or not a list'),
+        (b'{"frames": []}', "empty"),
+        (b'{"frames": [5]}', "frame 0 is not an object"),
+        (b'{"frames": [{"file_path": 3}]}', 'frame 0: "file_path"'),
+        (b'{"frames": [{"file_path": "./"}]}', 'frame 0: "file_path"'),
+    ],
+)
 def test_bad_json(tmp_path, text, message):
     write(tmp_path)
     (tmp_path / "transforms_train.json").write_bytes(text)
@@ -215,37 +237,43 @@ def posed(row, column, value):
     return pose
 
 
-@pytest.mark.parametrize("pose, message", [
-    (posed(0, 3, float("nan")), "NaN or infinity"),
-    (posed(0, 3, float("inf")), "NaN or infinity"),
-    (posed(0, 3, 10**400), "NaN or infinity"),
-    (posed(0, 0, 2), "scales, shears"),
-    (posed(0, 0, -1), "mirrors"),
-    (posed(3, 3, 0), "scales"),
-    (posed(0, 3, 1e30), "absurdly far"),
-    (posed(0, 0, "1"), "not a list of numbers"),
-    (posed(0, 0, True), "not a list of numbers"),
-    (POSE[:2], r"shape \(2, 4\)"),
-    ([[1, 2], [3]], "not a list of numbers"),
-    (7, "not a list of numbers"),
-    (None, "not a list of numbers"),
-])
+@pytest.mark.parametrize(
+    "pose, message",
+    [
+        (posed(0, 3, float("nan")), "NaN or infinity"),
+        (posed(0, 3, float("inf")), "NaN or infinity"),
+        (posed(0, 3, 10**400), "NaN or infinity"),
+        (posed(0, 0, 2), "scales, shears"),
+        (posed(0, 0, -1), "mirrors"),
+        (posed(3, 3, 0), "scales"),
+        (posed(0, 3, 1e30), "absurdly far"),
+        (posed(0, 0, "1"), "not a list of numbers"),
+        (posed(0, 0, True), "not a list of numbers"),
+        (POSE[:2], r"shape \(2, 4\)"),
+        ([[1, 2], [3]], "not a list of numbers"),
+        (7, "not a list of numbers"),
+        (None, "not a list of numbers"),
+    ],
+)
 def test_bad_pose(tmp_path, pose, message):
     write(tmp_path, [frame("a"), frame("b", pose)])
     with pytest.raises(UserError, match=f"frame 1: .*{message}"):
         load_dataset(tmp_path)
 
 
-@pytest.mark.parametrize("meta, message", [
-    ({"camera_angle_x": None}, 'neither "camera_angle_x" nor "fl_x"'),
-    ({"camera_angle_x": 39.6}, "radians between"),
-    ({"camera_angle_x": 0}, "radians between"),
-    ({"camera_angle_x": "wide"}, "'wide': give a number"),
-    ({"camera_angle_x": float("nan")}, "radians between"),
-    ({"fl_x": -1}, "\"fl_x\" is '-1'"),
-    ({"w": 0}, "\"w\" is '0'"),
-    ({"cx": []}, '"cx" is'),
-])
+@pytest.mark.parametrize(
+    "meta, message",
+    [
+        ({"camera_angle_x": None}, 'neither "camera_angle_x" nor "fl_x"'),
+        ({"camera_angle_x": 39.6}, "radians between"),
+        ({"camera_angle_x": 0}, "radians between"),
+        ({"camera_angle_x": "wide"}, "'wide': give a number"),
+        ({"camera_angle_x": float("nan")}, "radians between"),
+        ({"fl_x": -1}, "\"fl_x\" is '-1'"),
+        ({"w": 0}, "\"w\" is '0'"),
+        ({"cx": []}, '"cx" is'),
+    ],
+)
 def test_bad_intrinsics(tmp_path, meta, message):
     with pytest.raises(UserError, match=message):
         load_dataset(write(tmp_path, **meta))
@@ -319,7 +347,7 @@ def test_mutated_bytes_never_give_a_traceback(tmp_path):
             bad = bytearray(good)
             for _ in range(rng.randint(1, 4)):
                 i, n = rng.randrange(len(bad)), rng.choice([1, 1, 1, 8])
-                bad[i:i + n] = rng.choice([bytes([rng.randrange(256)]), b"", b"9", b"null", bad[i:i + n] * 2]) or b" "
+                bad[i : i + n] = rng.choice([bytes([rng.randrange(256)]), b"", b"9", b"null", bad[i : i + n] * 2]) or b" "
             file.write_bytes(bad)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")

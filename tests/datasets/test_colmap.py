@@ -39,6 +39,7 @@ def views(data):
 
 # ---- What comes out ----
 
+
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
 @pytest.mark.parametrize("folder", ["sparse/0", "sparse", ".", "colmap/sparse/0"])
 def test_every_place(tmp_path, folder, suffix):
@@ -57,8 +58,10 @@ LENSES = {
     "SIMPLE_RADIAL": ((95, *PRINCIPAL, -0.2), {"k1": -0.2}),
     "RADIAL": ((95, *PRINCIPAL, 0.12, 0.05), {"k1": 0.12, "k2": 0.05}),
     "OPENCV": ((*FOCAL, *PRINCIPAL, -0.15, 0.04, 0.02, -0.03), {"k1": -0.15, "k2": 0.04, "p1": 0.02, "p2": -0.03}),
-    "FULL_OPENCV": ((*FOCAL, *PRINCIPAL, 0.1, 0.02, 0.01, -0.01, 0.9, 0.2, 0.4, -0.8),
-                    {"k1": 0.1, "k2": 0.02, "p1": 0.01, "p2": -0.01, "k3": 0.9, "k4": 0.2, "k5": 0.4, "k6": -0.8}),
+    "FULL_OPENCV": (
+        (*FOCAL, *PRINCIPAL, 0.1, 0.02, 0.01, -0.01, 0.9, 0.2, 0.4, -0.8),
+        {"k1": 0.1, "k2": 0.02, "p1": 0.01, "p2": -0.01, "k3": 0.9, "k4": 0.2, "k5": 0.4, "k6": -0.8},
+    ),
 }
 
 
@@ -100,8 +103,14 @@ def test_photographs_in_linear_light(tmp_path):
 
 def test_smaller_copies(tmp_path):
     """images_4 for photographs of more than 1600 pixels, the camera with them; another file type counts."""
-    write_colmap(tmp_path, photographs(), "PINHOLE", (*(40 * f for f in FOCAL), *(40 * p for p in PRINCIPAL)),
-                 size=tuple(40 * n for n in SIZE), type=".JPG")
+    write_colmap(
+        tmp_path,
+        photographs(),
+        "PINHOLE",
+        (*(40 * f for f in FOCAL), *(40 * p for p in PRINCIPAL)),
+        size=tuple(40 * n for n in SIZE),
+        type=".JPG",
+    )
     for name, pixels in photographs(scale=2).items():
         save(tmp_path / "images_4" / f"{name}.png", pixels)
         save(tmp_path / "images_2" / f"{name}.png", pixels[:4, :6])
@@ -114,8 +123,14 @@ def test_smaller_copies(tmp_path):
 
 def test_smaller_copies_of_other_names(tmp_path):
     """LLFF's, in the order of the photographs."""
-    write_colmap(tmp_path, photographs(), "PINHOLE", (*(40 * f for f in FOCAL), *(40 * p for p in PRINCIPAL)),
-                 size=tuple(40 * n for n in SIZE), type=".JPG")
+    write_colmap(
+        tmp_path,
+        photographs(),
+        "PINHOLE",
+        (*(40 * f for f in FOCAL), *(40 * p for p in PRINCIPAL)),
+        size=tuple(40 * n for n in SIZE),
+        type=".JPG",
+    )
     for i, pixels in enumerate(photographs().values()):
         save(tmp_path / f"images_8/image{i:03d}.png", pixels)
     for i, view in enumerate(views(load_dataset(tmp_path))):
@@ -131,8 +146,15 @@ def test_which_copy(tmp_path):
     for name in ("images", "images_2", "images_4", "images_8", "images_x", "images_0"):
         (tmp_path / name).mkdir()
     names = {size: chosen(images, size).name for size in (800, 1600, 1601, 3115, 4946, 6401, 99999)}
-    assert names == {800: "images", 1600: "images", 1601: "images_2", 3115: "images_2", 4946: "images_4", 6401: "images_8",
-                     99999: "images_8"}
+    assert names == {
+        800: "images",
+        1600: "images",
+        1601: "images_2",
+        3115: "images_2",
+        4946: "images_4",
+        6401: "images_8",
+        99999: "images_8",
+    }
     images.rmdir()
     assert chosen(images, 800).name == "images_2"
 
@@ -232,6 +254,7 @@ def test_missing_photographs_do_not_move_the_split(tmp_path):
 
 # ---- What goes wrong ----
 
+
 def refused(root, message):
     with pytest.raises(UserError, match=message) as caught:
         load_dataset(root)
@@ -265,11 +288,16 @@ def test_truncated_and_miscounted_binaries(tmp_path, name):
     write_colmap(tmp_path, photographs(3))
     file = tmp_path / "sparse/0" / name
     good = file.read_bytes()
-    for bad, message in ((b"", "unpack_from requires"), (good[:5], "unpack_from requires"),
-                         (good[:-1], "it ends|the file has"),
-                         (good[:60], "it ends within record 0|no end"), (good + b"\0", "the file has"),
-                         (bytes(8), "no records"), (b"\xff" * 8 + good[8:], "it ends within|no end"),
-                         (struct.pack("<Q", 2**40) + good[8:], "it ends within|no end")):
+    for bad, message in (
+        (b"", "unpack_from requires"),
+        (good[:5], "unpack_from requires"),
+        (good[:-1], "it ends|the file has"),
+        (good[:60], "it ends within record 0|no end"),
+        (good + b"\0", "the file has"),
+        (bytes(8), "no records"),
+        (b"\xff" * 8 + good[8:], "it ends within|no end"),
+        (struct.pack("<Q", 2**40) + good[8:], "it ends within|no end"),
+    ):
         file.write_bytes(bad)
         refused(tmp_path, f"{name} cannot be used as a file of COLMAP .*({message}).*export the model again")
 
@@ -281,22 +309,25 @@ def test_keypoints_beyond_the_end(tmp_path):
     refused(tmp_path, "the file has")
 
 
-@pytest.mark.parametrize("name, old, new, message", [
-    ("cameras", "PINHOLE", "OPENCV", "4 parameters, and OPENCV takes 8"),
-    ("cameras", "PINHOLE 120", "PINHOLE wide", "invalid literal"),
-    ("cameras", "100.0", "nan", "not finite"),
-    ("cameras", "100.0", "1e300", "absurdly large"),
-    ("cameras", "100.0", "-100.0", "focal length -100 x 94 is out of range"),
-    ("cameras", "PINHOLE 120 96", "PINHOLE 0 96", "image size 0 x 96 is out of range"),
-    ("cameras", "PINHOLE 120 96", "PINHOLE 96 120", "its camera is 96 x 120, the photograph 120 x 96"),
-    ("cameras", "PINHOLE 120", "PINHOLE " + "9" * 400, "too large"),
-    ("cameras", "7 PINHOLE", "8 PINHOLE", "has camera 7, which cameras.txt lacks"),
-    ("images", " 7 v00.png", "", "invalid literal"),
-    ("images", "7 v00.png", "seven v00.png", "invalid literal"),
-    ("images", "v00.png", "v01.png", "same file name"),
-    ("images", "v00.png", "..", "has no file name"),
-    ("images", "v00.png", "v\t0\x1b.png", "has no file name"),
-])
+@pytest.mark.parametrize(
+    "name, old, new, message",
+    [
+        ("cameras", "PINHOLE", "OPENCV", "4 parameters, and OPENCV takes 8"),
+        ("cameras", "PINHOLE 120", "PINHOLE wide", "invalid literal"),
+        ("cameras", "100.0", "nan", "not finite"),
+        ("cameras", "100.0", "1e300", "absurdly large"),
+        ("cameras", "100.0", "-100.0", "focal length -100 x 94 is out of range"),
+        ("cameras", "PINHOLE 120 96", "PINHOLE 0 96", "image size 0 x 96 is out of range"),
+        ("cameras", "PINHOLE 120 96", "PINHOLE 96 120", "its camera is 96 x 120, the photograph 120 x 96"),
+        ("cameras", "PINHOLE 120", "PINHOLE " + "9" * 400, "too large"),
+        ("cameras", "7 PINHOLE", "8 PINHOLE", "has camera 7, which cameras.txt lacks"),
+        ("images", " 7 v00.png", "", "invalid literal"),
+        ("images", "7 v00.png", "seven v00.png", "invalid literal"),
+        ("images", "v00.png", "v01.png", "same file name"),
+        ("images", "v00.png", "..", "has no file name"),
+        ("images", "v00.png", "v\t0\x1b.png", "has no file name"),
+    ],
+)
 def test_bad_text(tmp_path, name, old, new, message):
     write_colmap(tmp_path, photographs(3), suffix=".txt")
     file = tmp_path / f"sparse/0/{name}.txt"
@@ -306,13 +337,16 @@ def test_bad_text(tmp_path, name, old, new, message):
 
 
 @pytest.mark.parametrize("suffix", [".bin", ".txt"])
-@pytest.mark.parametrize("pose, message", [
-    ((0, 0, 0, 0, 1, 2, 3), "no rotation and translation: q = 0 0 0 0"),
-    ((np.nan, 0, 0, 1, 1, 2, 3), "no rotation and translation: q = nan"),
-    ((1, 0, 0, 0, 1, np.inf, 3), "no rotation and translation.*t = 1 inf 3"),
-    ((1, 0, 0, 0, 1, 1e9, 3), "absurdly far"),
-    ((1e9, 0, 0, 0, 1, 2, 3), "no rotation"),
-])
+@pytest.mark.parametrize(
+    "pose, message",
+    [
+        ((0, 0, 0, 0, 1, 2, 3), "no rotation and translation: q = 0 0 0 0"),
+        ((np.nan, 0, 0, 1, 1, 2, 3), "no rotation and translation: q = nan"),
+        ((1, 0, 0, 0, 1, np.inf, 3), "no rotation and translation.*t = 1 inf 3"),
+        ((1, 0, 0, 0, 1, 1e9, 3), "absurdly far"),
+        ((1e9, 0, 0, 0, 1, 2, 3), "no rotation"),
+    ],
+)
 def test_bad_poses(tmp_path, pose, message, suffix):
     write_colmap(tmp_path, photographs(3), suffix=suffix)
     file = tmp_path / f"sparse/0/images{suffix}"

@@ -40,6 +40,7 @@ def views(data):
 
 # ---- What comes out ----
 
+
 def test_poses(tmp_path):
     data = load_dataset(write_nerfstudio(tmp_path, photographs()))
     assert [v.name for v in data.test] == ["v00", "v08"] and len(data.train) == 7 and data.points is None
@@ -50,8 +51,10 @@ def test_poses(tmp_path):
     assert not (tmp_path / "data").exists()  # nothing to undistort
 
 
-@pytest.mark.parametrize("lens", [{"k1": -0.2}, {"k1": 0.05, "k2": -0.1, "p1": 0.02, "p2": -0.03},
-                                  {"k1": -0.1, "k2": 0.05, "k3": -0.6, "k4": 9.0}])
+@pytest.mark.parametrize(
+    "lens",
+    [{"k1": -0.2}, {"k1": 0.05, "k2": -0.1, "p1": 0.02, "p2": -0.03}, {"k1": -0.1, "k2": 0.05, "k3": -0.6, "k4": 9.0}],
+)
 @pytest.mark.parametrize("per_frame", [False, True])
 def test_lenses(tmp_path, lens, per_frame):
     """k4 goes with the eighth power of the radius, which is not OpenCV's k4."""
@@ -70,8 +73,14 @@ def test_a_lens_of_one_frame_is_its_own(tmp_path):
     images, bent = photographs(), photographs(k1=-0.2)
     entries = frames(images)
     entries[3]["k1"] = -0.2
-    entries[4] |= {"fl_x": 2 * FOCAL[0], "fl_y": 2 * FOCAL[1], "cx": 2 * PRINCIPAL[0], "cy": 2 * PRINCIPAL[1],
-                   "w": 2 * SIZE[0], "h": 2 * SIZE[1]}
+    entries[4] |= {
+        "fl_x": 2 * FOCAL[0],
+        "fl_y": 2 * FOCAL[1],
+        "cx": 2 * PRINCIPAL[0],
+        "cy": 2 * PRINCIPAL[1],
+        "w": 2 * SIZE[0],
+        "h": 2 * SIZE[1],
+    }
     images["v03"] = bent["v03"]
     for view in views(load_dataset(write_nerfstudio(tmp_path, images, entries))):
         check_dots(view)
@@ -80,8 +89,14 @@ def test_a_lens_of_one_frame_is_its_own(tmp_path):
 def test_instant_ngp(tmp_path):
     """No extension, no camera_model, an angle for the focal length."""
     images = photographs()
-    meta = {"camera_angle_x": 2 * np.arctan(SIZE[0] / 2 / FOCAL[0]), "fl_y": FOCAL[1], "cx": PRINCIPAL[0],
-            "cy": PRINCIPAL[1], "aabb_scale": 4, "frames": frames(images, "./images", "")}
+    meta = {
+        "camera_angle_x": 2 * np.arctan(SIZE[0] / 2 / FOCAL[0]),
+        "fl_y": FOCAL[1],
+        "cx": PRINCIPAL[0],
+        "cy": PRINCIPAL[1],
+        "aabb_scale": 4,
+        "frames": frames(images, "./images", ""),
+    }
     for name, pixels in images.items():
         save(tmp_path / f"images/{name}.jpg", pixels)
     (tmp_path / "transforms.json").write_text(json.dumps(meta))
@@ -139,8 +154,9 @@ def test_points_of_the_named_cloud_are_in_the_frame_of_the_poses(tmp_path):
     (tmp_path / "clouds").mkdir()
     write_cloud(tmp_path / "clouds/sparse.ply", POINTS)
     write_cloud(tmp_path / "points3d.ply", 0 * POINTS)
-    data = load_dataset(write_nerfstudio(tmp_path, photographs(2), ply_file_path="clouds/sparse.ply",
-                                         applied_transform=EXCHANGE))
+    data = load_dataset(
+        write_nerfstudio(tmp_path, photographs(2), ply_file_path="clouds/sparse.ply", applied_transform=EXCHANGE)
+    )
     np.testing.assert_allclose(data.points, POINTS, atol=1e-6)
     np.testing.assert_allclose(data.point_colors, srgb_decode(COLORS / 255), atol=1e-6)
     with pytest.warns(UserWarning, match="ply_file_path 'gone.ply' is not there"):
@@ -161,38 +177,50 @@ def test_points_of_colmap_are_taken_there(tmp_path, suffix):
 
 # ---- What goes wrong ----
 
-@pytest.mark.parametrize("meta, message", [
-    ({"camera_model": "OPENCV_FISHEYE"}, "'OPENCV_FISHEYE' is no perspective lens .*undistort the photographs first"),
-    ({"camera_model": "EQUIRECTANGULAR"}, "is no perspective lens"),
-    ({"camera_model": 7}, "is no perspective lens"),
-    ({"camera_model": ["OPENCV"]}, "is no perspective lens"),
-    ({"is_fisheye": True}, "is no perspective lens"),
-    ({"k1": "bent"}, "\"k1\" is 'bent': give a number of distortion"),
-    ({"k1": float("nan")}, "\"k1\" is 'nan'"),
-    ({"p2": 1e9}, "\"p2\" is"),
-    ({"w": 96, "h": 120}, "its camera is 96 x 120, the photograph 120 x 96"),
-    ({"w": float("nan")}, "\"w\" is 'nan'"),
-    ({"train_filenames": "all"}, "\"train_filenames\" is not a list"),
-    ({"test_filenames": [3]}, "\"test_filenames\" is not a list"),
-    ({"test_filenames": ["images/v77.png"]}, "'images/v77.png' in the lists of file names is no frame's file_path"),
-    ({"test_filenames": ["images/v00.png", "images/v01.png"]}, "all 2 usable views are held out"),
-    ({"ply_file_path": 3}, "\"ply_file_path\" is not a file name"),
-    ({"frames": [{"file_path": "images/v00.png"}]}, "frame 0: \"transform_matrix\" is missing"),
-])
+
+@pytest.mark.parametrize(
+    "meta, message",
+    [
+        ({"camera_model": "OPENCV_FISHEYE"}, "'OPENCV_FISHEYE' is no perspective lens .*undistort the photographs first"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "is no perspective lens"),
+        ({"camera_model": 7}, "is no perspective lens"),
+        ({"camera_model": ["OPENCV"]}, "is no perspective lens"),
+        ({"is_fisheye": True}, "is no perspective lens"),
+        ({"k1": "bent"}, "\"k1\" is 'bent': give a number of distortion"),
+        ({"k1": float("nan")}, "\"k1\" is 'nan'"),
+        ({"p2": 1e9}, '"p2" is'),
+        ({"w": 96, "h": 120}, "its camera is 96 x 120, the photograph 120 x 96"),
+        ({"w": float("nan")}, "\"w\" is 'nan'"),
+        ({"train_filenames": "all"}, '"train_filenames" is not a list'),
+        ({"test_filenames": [3]}, '"test_filenames" is not a list'),
+        ({"test_filenames": ["images/v77.png"]}, "'images/v77.png' in the lists of file names is no frame's file_path"),
+        ({"test_filenames": ["images/v00.png", "images/v01.png"]}, "all 2 usable views are held out"),
+        ({"ply_file_path": 3}, '"ply_file_path" is not a file name'),
+        ({"frames": [{"file_path": "images/v00.png"}]}, 'frame 0: "transform_matrix" is missing'),
+    ],
+)
 def test_bad_entries(tmp_path, meta, message):
     with pytest.raises(UserError, match=message) as caught:
         load_dataset(write_nerfstudio(tmp_path, photographs(2), **meta))
     assert "\n" not in str(caught.value) and "transforms.json" in str(caught.value)
 
 
-@pytest.mark.parametrize("meta", [{"applied_transform": [[1, 0, 0, 0]]}, {"applied_transform": "none"},
-                                  {"applied_transform": [[1, 0, 0, float("nan")]] * 3},
-                                  {"applied_transform": [[1e300, 0, 0, 0]] * 3}, {"applied_transform": None},
-                                  {"applied_transform": [[1e6, 0, 0, 1e6]] * 3}, {"applied_scale": 0},
-                                  {"applied_scale": "large"}])
+@pytest.mark.parametrize(
+    "meta",
+    [
+        {"applied_transform": [[1, 0, 0, 0]]},
+        {"applied_transform": "none"},
+        {"applied_transform": [[1, 0, 0, float("nan")]] * 3},
+        {"applied_transform": [[1e300, 0, 0, 0]] * 3},
+        {"applied_transform": None},
+        {"applied_transform": [[1e6, 0, 0, 1e6]] * 3},
+        {"applied_scale": 0},
+        {"applied_scale": "large"},
+    ],
+)
 def test_bad_transforms_of_points(tmp_path, meta):
     write_colmap(tmp_path, photographs(2), folder="colmap/sparse/0")
-    with pytest.raises(UserError, match="applied_(transform|scale)\"") as caught:
+    with pytest.raises(UserError, match='applied_(transform|scale)"') as caught:
         load_dataset(write_nerfstudio(tmp_path, photographs(2), **meta))
     assert "\n" not in str(caught.value)
 
@@ -201,7 +229,7 @@ def test_bad_masks(tmp_path):
     images = photographs(2)
     entries = frames(images)
     entries[1]["mask_path"] = ["m.png"]
-    with pytest.raises(UserError, match="frame 1: \"mask_path\" is not a file name"):
+    with pytest.raises(UserError, match='frame 1: "mask_path" is not a file name'):
         load_dataset(write_nerfstudio(tmp_path, images, entries))
 
 

@@ -18,6 +18,7 @@ def views(data):
 
 # ---- What comes out ----
 
+
 @pytest.mark.parametrize("protocol", [0, 2, 4, 5])
 def test_poses(tmp_path, protocol):
     data = load_dataset(write_nero(tmp_path, photographs(11), protocol=protocol))
@@ -76,6 +77,7 @@ def test_the_truth_is_not_read(tmp_path):
 
 # ---- What goes wrong ----
 
+
 def test_missing_photographs(tmp_path):
     write_nero(tmp_path, photographs(4))
     (tmp_path / "2.png").unlink()
@@ -106,26 +108,29 @@ def test_hostile_pickles_are_not_run(tmp_path):
 POSE, INTRINSICS = np.eye(4)[:3], np.array([[90.0, 0, 60], [0, 90, 48], [0, 0, 1]])
 
 
-@pytest.mark.parametrize("camera, message", [
-    (b"", "1-camera.pkl"),
-    (pickle.dumps([POSE, INTRINSICS])[:-20], "1-camera.pkl"),
-    (pickle.dumps(POSE), "holds no camera"),
-    (pickle.dumps([POSE]), "holds no camera"),
-    (pickle.dumps([POSE, INTRINSICS, 3]), "holds no camera"),
-    (pickle.dumps([POSE[:2], INTRINSICS]), "holds no camera"),
-    (pickle.dumps([POSE[:, :3], INTRINSICS]), "holds no camera"),
-    (pickle.dumps([POSE, INTRINSICS[:2]]), "holds no camera"),
-    (pickle.dumps([POSE, "wide"]), "holds no camera"),
-    (pickle.dumps([POSE, {"f": 3}]), "holds no camera"),
-    (pickle.dumps([POSE, INTRINSICS + np.eye(3)]), "holds no camera"),
-    (pickle.dumps([POSE, INTRINSICS + [[0, np.nan, 0], [0, 0, 0], [0, 0, 0]]]), "holds no camera"),
-    (pickle.dumps([POSE, -INTRINSICS + 2 * np.diag([0, 0, 1])]), "focal length -90 x -90 is out of range"),
-    (pickle.dumps([POSE, INTRINSICS * [[np.nan, 1, 1]]]), "holds no camera|out of range"),
-    (pickle.dumps([POSE * np.nan, INTRINSICS]), "holds NaN"),
-    (pickle.dumps([2 * POSE, INTRINSICS]), "scales"),
-    (pickle.dumps([POSE * [[1], [1], [-1]], INTRINSICS]), "mirrors"),
-    (pickle.dumps([POSE + [0, 0, 0, 1e9], INTRINSICS]), "absurdly far"),
-])
+@pytest.mark.parametrize(
+    "camera, message",
+    [
+        (b"", "1-camera.pkl"),
+        (pickle.dumps([POSE, INTRINSICS])[:-20], "1-camera.pkl"),
+        (pickle.dumps(POSE), "holds no camera"),
+        (pickle.dumps([POSE]), "holds no camera"),
+        (pickle.dumps([POSE, INTRINSICS, 3]), "holds no camera"),
+        (pickle.dumps([POSE[:2], INTRINSICS]), "holds no camera"),
+        (pickle.dumps([POSE[:, :3], INTRINSICS]), "holds no camera"),
+        (pickle.dumps([POSE, INTRINSICS[:2]]), "holds no camera"),
+        (pickle.dumps([POSE, "wide"]), "holds no camera"),
+        (pickle.dumps([POSE, {"f": 3}]), "holds no camera"),
+        (pickle.dumps([POSE, INTRINSICS + np.eye(3)]), "holds no camera"),
+        (pickle.dumps([POSE, INTRINSICS + [[0, np.nan, 0], [0, 0, 0], [0, 0, 0]]]), "holds no camera"),
+        (pickle.dumps([POSE, -INTRINSICS + 2 * np.diag([0, 0, 1])]), "focal length -90 x -90 is out of range"),
+        (pickle.dumps([POSE, INTRINSICS * [[np.nan, 1, 1]]]), "holds no camera|out of range"),
+        (pickle.dumps([POSE * np.nan, INTRINSICS]), "holds NaN"),
+        (pickle.dumps([2 * POSE, INTRINSICS]), "scales"),
+        (pickle.dumps([POSE * [[1], [1], [-1]], INTRINSICS]), "mirrors"),
+        (pickle.dumps([POSE + [0, 0, 0, 1e9], INTRINSICS]), "absurdly far"),
+    ],
+)
 def test_bad_cameras(tmp_path, camera, message):
     write_nero(tmp_path, photographs(3))
     (tmp_path / "1-camera.pkl").write_bytes(camera)

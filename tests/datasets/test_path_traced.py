@@ -81,7 +81,7 @@ def test_depth_and_pose_reproduce_the_geometry(dataset):
             assert np.median(np.abs(distance - RADIUS)) < 2e-3
             pixel, _ = camera.project(CENTER[None])
             assert np.allclose(pixel, SIZE / 2, atol=1e-4)
-            assert 0.85 < 2 * np.sqrt((m["Alpha"]).sum() / np.pi) / SIZE <= 1      # it fills the frame
+            assert 0.85 < 2 * np.sqrt((m["Alpha"]).sum() / np.pi) / SIZE <= 1  # it fills the frame
 
 
 def test_normals_and_materials(dataset):
@@ -140,7 +140,7 @@ def test_interrupted_rendering_resumes(scene_file, dataset, tmp_path, monkeypatc
     assert len(calls) == 1
     for file in (p.relative_to(out) for p in out.rglob("*.png")):
         a, b = (np.array(mi.Bitmap(str(root / file))).astype(int) for root in (out, dataset))
-        assert np.abs(a - b).max() <= 1         # atomic additions in the film: the last bit may differ
+        assert np.abs(a - b).max() <= 1  # atomic additions in the film: the last bit may differ
 
 
 def test_other_settings_render_again(scene_file, tmp_path, monkeypatch):
@@ -151,10 +151,18 @@ def test_other_settings_render_again(scene_file, tmp_path, monkeypatch):
     assert len(calls) == 4 and np.isclose(maps(out / "test" / "r_0")["Roughness"].max(), 0.5)
 
 
-@pytest.mark.parametrize("content, message", [
-    ("<scene", "cannot load"), ('<scene version="3.0.0"/>', "no shapes"),
-    ('<scene version="3.0.0"><shape type="procedural_mesh"><string name="model" value="helmet"/>'
-     '<string name="part" value="antenna"/></shape></scene>', "visor")])
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        ("<scene", "cannot load"),
+        ('<scene version="3.0.0"/>', "no shapes"),
+        (
+            '<scene version="3.0.0"><shape type="procedural_mesh"><string name="model" value="helmet"/>'
+            '<string name="part" value="antenna"/></shape></scene>',
+            "visor",
+        ),
+    ],
+)
 def test_bad_scenes(content, message, tmp_path):
     scene = tmp_path / "bad.xml"
     scene.write_text(content)

@@ -23,7 +23,7 @@ LINEAR = srgb_decode(RGB / 255).astype(np.float32)
 
 
 def ply(path, kind="u1", text=False, order="<", position="f4", xyz=XYZ):
-    colors = (RGB / 255 if kind and kind[0] == "f" else RGB)[:len(xyz)]
+    colors = (RGB / 255 if kind and kind[0] == "f" else RGB)[: len(xyz)]
     fields = [(n, position) for n in "xyz"] + [("nx", "f4")]
     fields += [(n, kind) for n in ("red", "green", "blue")] if kind else []
     rows = np.zeros(len(xyz), fields)
@@ -36,16 +36,19 @@ def ply(path, kind="u1", text=False, order="<", position="f4", xyz=XYZ):
 
 
 def colmap_binary(path, xyz=XYZ):
-    points = [struct.pack("<Q3d3BdQ", 7 + i, *p, *c, 0.5, i) + struct.pack("<ii", 3, 4) * i
-              for i, (p, c) in enumerate(zip(xyz, RGB))]
+    points = [
+        struct.pack("<Q3d3BdQ", 7 + i, *p, *c, 0.5, i) + struct.pack("<ii", 3, 4) * i
+        for i, (p, c) in enumerate(zip(xyz, RGB))
+    ]
     path.write_bytes(struct.pack("<Q", len(points)) + b"".join(points))
     return path
 
 
 def colmap_text(path, xyz=XYZ):
     lines = ["# 3D point list with one line of data per point:", "#   POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]", ""]
-    lines += [f"{7 + i} {' '.join(map(str, p))} {' '.join(map(str, c))} 0.5{' 3 4' * i}"
-              for i, (p, c) in enumerate(zip(xyz, RGB))]
+    lines += [
+        f"{7 + i} {' '.join(map(str, p))} {' '.join(map(str, c))} 0.5{' 3 4' * i}" for i, (p, c) in enumerate(zip(xyz, RGB))
+    ]
     path.write_text("\n".join(lines) + "\n")
     return path
 
@@ -66,6 +69,7 @@ def expect(root, colors=LINEAR):
 
 # ---- What comes out ----
 
+
 @pytest.mark.parametrize("name", FILES)
 def test_every_place(tmp_path, name):
     (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -73,8 +77,10 @@ def test_every_place(tmp_path, name):
     expect(tmp_path)
 
 
-@pytest.mark.parametrize("form", [{}, {"text": True}, {"order": ">"}, {"kind": "f4"}, {"kind": "f8", "text": True},
-                                  {"kind": "i4"}, {"position": "f8"}])
+@pytest.mark.parametrize(
+    "form",
+    [{}, {"text": True}, {"order": ">"}, {"kind": "f4"}, {"kind": "f8", "text": True}, {"kind": "i4"}, {"position": "f8"}],
+)
 def test_every_kind_of_ply(tmp_path, form):
     ply(tmp_path / "points.ply", **form)
     expect(tmp_path)
@@ -102,6 +108,7 @@ def test_the_first_file_counts_and_none_is_no_error(tmp_path):
 
 # ---- What goes wrong ----
 
+
 def refused(path, message):
     """One line that names the file, the reason and the remedy."""
     with pytest.raises(UserError, match=message) as caught:
@@ -120,23 +127,26 @@ def test_values_that_no_point_has(tmp_path, name):
     refused(tmp_path / name, "no PLY header|holds no points|declares 0 points in 0 bytes")
 
 
-@pytest.mark.parametrize("old, new, message", [
-    (b"ply\n", b"PLY\n", "no PLY header"),
-    (b"ply\n", b"ply!", "no PLY header"),
-    (b"end_header", b"comment x", "no PLY header"),
-    (b"element vertex 4", b"element vertex 5", "early end-of-file"),
-    (b"element vertex 4", b"element vertex 4000000000", "declares 4000000000 elements"),
-    (b"element vertex 4", b"\telement\x1fvertex +4_000_000_000", "declares 4000000000 elements"),
-    (b"element vertex 4", b"element vertex -4", "declares -4 elements"),
-    (b"element vertex 4", b"element vertex many", "invalid literal"),
-    (b"element vertex 4", b"element vertices 4", "no elements 'vertex'"),
-    (b"element vertex 4", b"comment end_header\nelement vertex 4000000000", "declares 4000000000"),
-    (b"property float x", b"property float u", "no property 'x'"),
-    (b"property float x", b"property half x", "half"),
-    (b"property float x", b"property list uchar float x", "have lists"),
-    (b"property float x", b"property float x\xff", "ascii"),
-    (b"end_header", b"element face 2\nproperty list uint double i\nend_header", "'face' have lists"),
-])
+@pytest.mark.parametrize(
+    "old, new, message",
+    [
+        (b"ply\n", b"PLY\n", "no PLY header"),
+        (b"ply\n", b"ply!", "no PLY header"),
+        (b"end_header", b"comment x", "no PLY header"),
+        (b"element vertex 4", b"element vertex 5", "early end-of-file"),
+        (b"element vertex 4", b"element vertex 4000000000", "declares 4000000000 elements"),
+        (b"element vertex 4", b"\telement\x1fvertex +4_000_000_000", "declares 4000000000 elements"),
+        (b"element vertex 4", b"element vertex -4", "declares -4 elements"),
+        (b"element vertex 4", b"element vertex many", "invalid literal"),
+        (b"element vertex 4", b"element vertices 4", "no elements 'vertex'"),
+        (b"element vertex 4", b"comment end_header\nelement vertex 4000000000", "declares 4000000000"),
+        (b"property float x", b"property float u", "no property 'x'"),
+        (b"property float x", b"property half x", "half"),
+        (b"property float x", b"property list uchar float x", "have lists"),
+        (b"property float x", b"property float x\xff", "ascii"),
+        (b"end_header", b"element face 2\nproperty list uint double i\nend_header", "'face' have lists"),
+    ],
+)
 def test_bad_ply(tmp_path, old, new, message):
     file = ply(tmp_path / "points.ply")
     file.write_bytes(file.read_bytes().replace(old, new))
@@ -166,7 +176,7 @@ def test_bad_colmap_binary(tmp_path):
         (good + b"\0", "the file has"),
         (good[:120], "declares 4 points"),
         (good[:-24], "the file has"),
-        (good[:51 + 8 + 51 + 8 + 10] + bytes(100), "the file has"),
+        (good[: 51 + 8 + 51 + 8 + 10] + bytes(100), "the file has"),
         (b"\xff" * 8 + good[8:], "declares 18446744073709551615 points"),
         (good[:51] + b"\xff" * 8 + good[59:], "ends within point 1"),
         (good[:5], "declares 4 points in 5 bytes"),
@@ -175,14 +185,17 @@ def test_bad_colmap_binary(tmp_path):
         refused(file, message)
 
 
-@pytest.mark.parametrize("line, message", [
-    ("9 1 2 three 0 0 0 0.5", "three"),
-    ("9 1 2 3 0 0", "invalid column index"),
-    ("9 1 2 3 0 256 0 0.5", "colour of point 4"),
-    ("9 1 2 3 0 -1 0 0.5", "colour of point 4"),
-    ("9 1e999 2 3 0 0 0 0.5", "point 4 has a coordinate"),
-    ("9 \0 2 3 0 0 0 0.5", "could not convert"),
-])
+@pytest.mark.parametrize(
+    "line, message",
+    [
+        ("9 1 2 three 0 0 0 0.5", "three"),
+        ("9 1 2 3 0 0", "invalid column index"),
+        ("9 1 2 3 0 256 0 0.5", "colour of point 4"),
+        ("9 1 2 3 0 -1 0 0.5", "colour of point 4"),
+        ("9 1e999 2 3 0 0 0 0.5", "point 4 has a coordinate"),
+        ("9 \0 2 3 0 0 0 0.5", "could not convert"),
+    ],
+)
 def test_bad_colmap_text(tmp_path, line, message):
     file = colmap_text(tmp_path / "points3D.txt")
     with open(file, "a") as stream:
@@ -195,8 +208,9 @@ def test_colmap_text_that_is_no_text(tmp_path):
     refused(tmp_path / "points3D.txt", "utf-8")
 
 
-@pytest.mark.parametrize("name, form", [("points.ply", {}), ("points.ply", {"text": True}), ("points3D.bin", {}),
-                                        ("points3D.txt", {})])
+@pytest.mark.parametrize(
+    "name, form", [("points.ply", {}), ("points.ply", {"text": True}), ("points3D.bin", {}), ("points3D.txt", {})]
+)
 def test_mutated_bytes_never_give_a_traceback(tmp_path, name, form):
     rng, file = random.Random(0), tmp_path / name
     good = WRITERS[file.suffix](file, **form).read_bytes()
@@ -204,7 +218,7 @@ def test_mutated_bytes_never_give_a_traceback(tmp_path, name, form):
         bad = bytearray(good)
         for _ in range(rng.randint(1, 4)):
             i, n = rng.randrange(len(bad)), rng.choice([1, 1, 1, 8])
-            bad[i:i + n] = rng.choice([bytes([rng.randrange(256)]), b"", b"9", b"\xff" * n, bad[i:i + n] * 2]) or b" "
+            bad[i : i + n] = rng.choice([bytes([rng.randrange(256)]), b"", b"9", b"\xff" * n, bad[i : i + n] * 2]) or b" "
         file.write_bytes(bad)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -219,14 +233,16 @@ def test_mutated_bytes_never_give_a_traceback(tmp_path, name, form):
 
 # ---- A fit's start ----
 
+
 def capture(root, mode):
     """Two photographs, uniformly (128, 64, 32), of what stands at the origin."""
     (root / "train").mkdir()
     frames = []
     for name, x in (("a", 0.0), ("b", 0.5)):
-        Image.new(mode, (24, 16), (128, 64, 32, 255)[:len(mode)]).save(root / "train" / f"{name}.png")
-        frames.append({"file_path": f"./train/{name}", "transform_matrix": [[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 20],
-                                                                            [0, 0, 0, 1]]})
+        Image.new(mode, (24, 16), (128, 64, 32, 255)[: len(mode)]).save(root / "train" / f"{name}.png")
+        frames.append(
+            {"file_path": f"./train/{name}", "transform_matrix": [[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 20], [0, 0, 0, 1]]}
+        )
     (root / "transforms_train.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
     return root
 

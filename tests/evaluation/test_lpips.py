@@ -19,22 +19,31 @@ COMPARED = {"vgg": (1, 3, 6, 9, 12), "alex": (0, 1, 2, 3, 4)}  # convolutions
 
 # ---- Slow twin ----
 
+
 def make_parameters(network, seed=0):
     """A file's content, of random networks with a few channels."""
     rng = np.random.default_rng(seed)
     widths = WIDTHS[network]
-    convolutions = {f"Conv_{k}": {"kernel": rng.normal(0, 1.4 / size / np.sqrt(c), (size, size, c, n)).astype(np.float32),
-                                  "bias": rng.normal(0, 0.2, n).astype(np.float32)}
-                    for k, (size, c, n) in enumerate(zip(SIZES[network], widths, widths[1:]))}
-    heads = {f"NetLinLayer_{number}": {"Conv_0": {"kernel": rng.random((1, 1, widths[k + 1], 1), np.float32)}}
-             for number, k in enumerate(COMPARED[network])}
+    convolutions = {
+        f"Conv_{k}": {
+            "kernel": rng.normal(0, 1.4 / size / np.sqrt(c), (size, size, c, n)).astype(np.float32),
+            "bias": rng.normal(0, 0.2, n).astype(np.float32),
+        }
+        for k, (size, c, n) in enumerate(zip(SIZES[network], widths, widths[1:]))
+    }
+    heads = {
+        f"NetLinLayer_{number}": {"Conv_0": {"kernel": rng.random((1, 1, widths[k + 1], 1), np.float32)}}
+        for number, k in enumerate(COMPARED[network])
+    }
     return {NAMES[network][1]: convolutions} | heads
 
 
 def correlate(x, kernel, bias, stride, padding):
     x = np.pad(x, ((padding, padding), (padding, padding), (0, 0)))
-    layers = [sum(correlate2d(x[..., c], kernel[..., c, k], "valid") for c in range(x.shape[-1])) + bias[k]
-              for k in range(len(bias))]
+    layers = [
+        sum(correlate2d(x[..., c], kernel[..., c, k], "valid") for c in range(x.shape[-1])) + bias[k]
+        for k in range(len(bias))
+    ]
     return np.stack(layers, -1)[::stride, ::stride]
 
 
@@ -42,15 +51,18 @@ def correlate_torch(x, kernel, bias, stride, padding):
     from torch import from_numpy
     from torch.nn.functional import conv2d
 
-    x, kernel, bias = (from_numpy(np.ascontiguousarray(v, np.float64))
-                       for v in (x.transpose(2, 0, 1)[None], kernel.transpose(3, 2, 0, 1), bias))
+    x, kernel, bias = (
+        from_numpy(np.ascontiguousarray(v, np.float64))
+        for v in (x.transpose(2, 0, 1)[None], kernel.transpose(3, 2, 0, 1), bias)
+    )
     return conv2d(x, kernel, bias, stride, padding)[0].numpy().transpose(1, 2, 0)
 
 
 def maximum(x, window):
     height, width = ((n - window) // 2 + 1 for n in x.shape[:2])
-    return np.array([[x[2 * i:2 * i + window, 2 * j:2 * j + window].max((0, 1)) for j in range(width)]
-                     for i in range(height)])
+    return np.array(
+        [[x[2 * i : 2 * i + window, 2 * j : 2 * j + window].max((0, 1)) for j in range(width)] for i in range(height)]
+    )
 
 
 def features(image, network, parameters, correlate):
@@ -70,7 +82,7 @@ def features(image, network, parameters, correlate):
 def twin(a, b, network, parameters, correlate=correlate):
     pairs = zip(features(a, network, parameters, correlate), features(b, network, parameters, correlate))
     weight = lambda k: parameters[f"NetLinLayer_{k}"]["Conv_0"]["kernel"][0, 0]
-    return sum(((x - y)**2 @ weight(k)).mean() for k, (x, y) in enumerate(pairs))
+    return sum(((x - y) ** 2 @ weight(k)).mean() for k, (x, y) in enumerate(pairs))
 
 
 @pytest.fixture
@@ -95,7 +107,7 @@ def pairs(count, network):
         height, width = rng.integers(lpips._LAYOUTS[network].minimum, 60, 2)
         a = rng.random((height, width, 3))
         if k % 2:
-            a[:, : width // 2] = a[height // 2:] = 1
+            a[:, : width // 2] = a[height // 2 :] = 1
         b = np.clip(a + rng.normal(0, 0.1, a.shape) * (a < 1), 0, 1)
         if k % 4 == 3:
             b = np.where(rng.random((height, width, 1)) < 0.01, b * 0.5, a)
@@ -103,6 +115,7 @@ def pairs(count, network):
 
 
 # ---- Distances ----
+
 
 @pytest.mark.parametrize("network", SIZES)
 def test_is_its_slow_twin(weights, network):
@@ -154,6 +167,7 @@ def test_real_weights(network, value):
 
 # ---- Weights ----
 
+
 def test_no_weights(monkeypatch):
     monkeypatch.setattr(lpips, "installed", lambda: False)
     lpips._stages.cache_clear()
@@ -189,8 +203,19 @@ def numbers(parameters):
     return pickle.dumps(parameters)
 
 
-@pytest.mark.parametrize("damage", [cut, without_a_layer, not_finite, of_another_shape, numbers,
-                                    lambda _: pickle.dumps(Evil()), lambda _: b"", lambda _: None])
+@pytest.mark.parametrize(
+    "damage",
+    [
+        cut,
+        without_a_layer,
+        not_finite,
+        of_another_shape,
+        numbers,
+        lambda _: pickle.dumps(Evil()),
+        lambda _: b"",
+        lambda _: None,
+    ],
+)
 def test_damaged_weights(weights, damage, capsys):
     path = weights["folder"] / "vgg16.ckpt"
     content = damage(make_parameters("vgg"))
@@ -203,10 +228,18 @@ def test_damaged_weights(weights, damage, capsys):
 
 # ---- Pickles ----
 
+
 @pytest.mark.parametrize("protocol", range(6))
 def test_pickles_of_arrays(protocol):
-    arrays = [np.arange(6.0, dtype=">f4").reshape(2, 3), np.asfortranarray(np.eye(3)), np.arange(24).reshape(2, 3, 4).T,
-              np.zeros((0, 3)), np.float32(2.5), np.array(True), np.arange(24).reshape(2, 3, 4).transpose(1, 2, 0)]
+    arrays = [
+        np.arange(6.0, dtype=">f4").reshape(2, 3),
+        np.asfortranarray(np.eye(3)),
+        np.arange(24).reshape(2, 3, 4).T,
+        np.zeros((0, 3)),
+        np.float32(2.5),
+        np.array(True),
+        np.arange(24).reshape(2, 3, 4).transpose(1, 2, 0),
+    ]
     read = unpickle.load(io.BytesIO(pickle.dumps({"arrays": arrays, "words": ("a", 1, None)}, protocol)))
     assert read["words"] == ("a", 1, None) and len(read["arrays"]) == len(arrays)
     for array, truth in zip(read["arrays"], arrays):
@@ -214,8 +247,9 @@ def test_pickles_of_arrays(protocol):
         np.testing.assert_array_equal(array, truth)
 
 
-@pytest.mark.parametrize("content", [
-    Evil(), np.array([Evil()], object), np.dtype("O"), np.zeros(3, "V4"), io.BytesIO, Exception("x")])
+@pytest.mark.parametrize(
+    "content", [Evil(), np.array([Evil()], object), np.dtype("O"), np.zeros(3, "V4"), io.BytesIO, Exception("x")]
+)
 def test_pickles_of_anything_else(content, tmp_path, capsys):
     path = tmp_path / "file.pkl"
     for protocol in range(6):

@@ -35,17 +35,18 @@ def test_ssim_uses_the_11_pixel_window(pair):
 def slow_ssim(a, b):
     """Equation 13 of Wang et al. 2004 at each pixel that has a whole 11 x 11 window, and its mean."""
     offset = np.arange(-5, 6)
-    window = np.exp(-(offset[:, None]**2 + offset**2) / (2 * 1.5**2))
+    window = np.exp(-(offset[:, None] ** 2 + offset**2) / (2 * 1.5**2))
     window = (window / window.sum())[..., None]
     mean = lambda patch: (window * patch).sum((0, 1))
     values = []
     for y in range(a.shape[0] - 10):
         for x in range(a.shape[1] - 10):
-            p, q = (image[y:y + 11, x:x + 11] for image in (a, b))
+            p, q = (image[y : y + 11, x : x + 11] for image in (a, b))
             mp, mq = mean(p), mean(q)
-            vp, vq, covariance = mean((p - mp)**2), mean((q - mq)**2), mean((p - mp) * (q - mq))
-            values.append((2 * mp * mq + 0.01**2) * (2 * covariance + 0.03**2)
-                          / ((mp**2 + mq**2 + 0.01**2) * (vp + vq + 0.03**2)))
+            vp, vq, covariance = mean((p - mp) ** 2), mean((q - mq) ** 2), mean((p - mp) * (q - mq))
+            values.append(
+                (2 * mp * mq + 0.01**2) * (2 * covariance + 0.03**2) / ((mp**2 + mq**2 + 0.01**2) * (vp + vq + 0.03**2))
+            )
     return np.mean(values)
 
 
@@ -64,6 +65,7 @@ def test_normal_colors():
 
 
 # ---- Scores of a view ----
+
 
 @pytest.fixture
 def scored():

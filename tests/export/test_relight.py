@@ -34,8 +34,14 @@ def run(inputs, tmp_path_factory):
     from rgs_mi.commands.optimize import optimize
 
     scene, data = inputs
-    return optimize(scene, data=data, out=tmp_path_factory.mktemp("runs") / "ball", overrides=SETTINGS, quiet=True,
-                    variables={"diffuse": "lit"})
+    return optimize(
+        scene,
+        data=data,
+        out=tmp_path_factory.mktemp("runs") / "ball",
+        overrides=SETTINGS,
+        quiet=True,
+        variables={"diffuse": "lit"},
+    )
 
 
 def render(scene, **options):
@@ -48,11 +54,24 @@ def test_light_in_a_stock_scene_reproduces_the_photographs(run, inputs):
     views = load_dataset(inputs[1]).train
 
     def psnr(pixels):
-        bsdf = {"type": "principled", "metallic": 1.0, "roughness": 0.25,
-                "base_color": {"type": "rgb", "value": [0.6, 0.4, 0.2]}}
-        scene = mi.load_dict({"type": "scene", "integrator": {"type": "path", "hide_emitters": True}, "ball": {
-            "type": "sphere", "bsdf": bsdf}, "light": {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(pixels)),
-                                                       "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90)}})
+        bsdf = {
+            "type": "principled",
+            "metallic": 1.0,
+            "roughness": 0.25,
+            "base_color": {"type": "rgb", "value": [0.6, 0.4, 0.2]},
+        }
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": "path", "hide_emitters": True},
+                "ball": {"type": "sphere", "bsdf": bsdf},
+                "light": {
+                    "type": "envmap",
+                    "bitmap": mi.Bitmap(np.ascontiguousarray(pixels)),
+                    "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90),
+                },
+            }
+        )
         errors = []
         for view in views[:4]:
             color = straight(np.array(mi.render(scene, sensor=mi.load_dict(sensor_dict(view.camera)), spp=64)))
@@ -61,8 +80,13 @@ def test_light_in_a_stock_scene_reproduces_the_photographs(run, inputs):
         return np.mean(errors)
 
     right = psnr(exported)
-    wrong = [np.roll(exported, exported.shape[1] // 4, 1), exported[::-1], exported[:, ::-1],
-             np.roll(exported, exported.shape[1] // 2, 1), np.roll(exported, exported.shape[1] // 16, 1)]
+    wrong = [
+        np.roll(exported, exported.shape[1] // 4, 1),
+        exported[::-1],
+        exported[:, ::-1],
+        np.roll(exported, exported.shape[1] // 2, 1),
+        np.roll(exported, exported.shape[1] // 16, 1),
+    ]
     assert right > 24 and all(psnr(pixels) < right - 2 for pixels in wrong)
 
 
@@ -116,10 +140,16 @@ def test_script_options(run, tmp_path):
     assert plain[0].read_bytes() != other[0].read_bytes()
 
 
-@pytest.mark.parametrize("options, words", [
-    ({"envmap": "none.exr"}, "no environment map at none.exr"), ({"changes": ["colour=1"]}, "unknown material 'colour'"),
-    ({"changes": ["roughness=1.5"]}, "from 0 to 1"), ({"changes": ["roughness=a"]}, "expected roughness=NUMBER"),
-    ({"changes": ["roughness=0.1,0.2"]}, "needs 1 number")])
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        ({"envmap": "none.exr"}, "no environment map at none.exr"),
+        ({"changes": ["colour=1"]}, "unknown material 'colour'"),
+        ({"changes": ["roughness=1.5"]}, "from 0 to 1"),
+        ({"changes": ["roughness=a"]}, "expected roughness=NUMBER"),
+        ({"changes": ["roughness=0.1,0.2"]}, "needs 1 number"),
+    ],
+)
 def test_mistakes(run, tmp_path, options, words):
     with pytest.raises(UserError, match=words):
         render_scene(run, out=tmp_path / "a.png", quiet=True, **options)
@@ -136,9 +166,11 @@ def test_bad_environment_maps(run, tmp_path):
 def test_recovery(run, inputs, tmp_path, monkeypatch):
     """Of the ball, whose light and material the fit comes close to; the figures are those that are written."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "ball.xml").write_text(TARGET.replace('<scene version="3.0.0">', '<scene version="3.0.0"><default '
-                                       'name="environment" value="studio"/>').replace('value="studio"/> <i',
-                                                                                      'value="$environment"/> <i'))
+    (tmp_path / "ball.xml").write_text(
+        TARGET.replace(
+            '<scene version="3.0.0">', '<scene version="3.0.0"><default name="environment" value="studio"/>'
+        ).replace('value="studio"/> <i', 'value="$environment"/> <i')
+    )
     figures = recovery(run, tmp_path / "ball.xml", ["kitchen"], size=32, quiet=True)
     assert figures == json.loads((run / "recovery" / "recovery.json").read_text())
     assert figures["roughness_mae"] < 0.2 and figures["metallic_mae"] < 0.6 and figures["base_color_mae"] < 0.3
@@ -158,8 +190,9 @@ def test_true_maps(inputs):
 def test_hidden():
     """A ball over a floor hides the sky from what is under it, and not from what is beside it; not from a point that has
     sunk a little into the floor either."""
-    scene = mi.load_dict({"type": "scene", "floor": {"type": "rectangle"},
-                          "ball": {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.3}})
+    scene = mi.load_dict(
+        {"type": "scene", "floor": {"type": "rectangle"}, "ball": {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.3}}
+    )
     point = np.array([[0, 0, 0], [0.8, 0, 0], [0.8, 0, -1e-4]])
     up = np.tile([0.0, 0.0, 1.0], (3, 1))
     assert hidden(scene, point, up, up).tolist() == [True, False, False]

@@ -22,7 +22,7 @@ def frames(tmp_path):
     paths = []
     for k in range(14):
         pixels = np.zeros((SIZE[1], SIZE[0], 4), np.uint8)
-        pixels[6:14, k:k + 12] = [255, 0, 0, 128]
+        pixels[6:14, k : k + 12] = [255, 0, 0, 128]
         paths.append(tmp_path / f"{k:03}.png")
         Image.fromarray(pixels).save(paths[-1])
     return paths
@@ -80,15 +80,24 @@ def test_no_encoder(frames, tmp_path, monkeypatch):
         return real(name, *arguments, **options)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    for call in (lambda: video.write(tmp_path / "out", frames),
-                 lambda: render.render_scene(tmp_path / "missing.xml", turntable=3, filmed=True)):
+    for call in (
+        lambda: video.write(tmp_path / "out", frames),
+        lambda: render.render_scene(tmp_path / "missing.xml", turntable=3, filmed=True),
+    ):
         with pytest.raises(UserError, match="pip install imageio-ffmpeg"):
             call()
 
 
-@pytest.mark.parametrize("options, message", [
-    ({"turntable": 0}, "--turntable 0: needs 1 to"), ({"turntable": -3}, "needs 1"), ({"along": -1}, "--path -1: needs"),
-    ({"along": 10**9}, "to 10000 frames"), ({"filmed": True}, "add --turntable N or --path")])
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"turntable": 0}, "--turntable 0: needs 1 to"),
+        ({"turntable": -3}, "needs 1"),
+        ({"along": -1}, "--path -1: needs"),
+        ({"along": 10**9}, "to 10000 frames"),
+        ({"filmed": True}, "add --turntable N or --path"),
+    ],
+)
 def test_mistakes(tmp_path, options, message):
     with pytest.raises(UserError, match=message):
         render.render_scene(tmp_path / "scene.xml", **options)
@@ -103,8 +112,10 @@ SENSOR = """<sensor type="perspective" id="{name}"><float name="fov" value="{fov
 
 def scene_of(folder, *sensors):
     path = folder / "scene.xml"
-    path.write_text("<scene version='3.0.0'><integrator type='path'/><emitter type='constant'/><shape type='sphere'/>"
-                    f"{''.join(SENSOR.format(**sensor) for sensor in sensors)}</scene>")
+    path.write_text(
+        "<scene version='3.0.0'><integrator type='path'/><emitter type='constant'/><shape type='sphere'/>"
+        f"{''.join(SENSOR.format(**sensor) for sensor in sensors)}</scene>"
+    )
     return path
 
 

@@ -74,8 +74,11 @@ def test_depth_normals_agree_on_a_smooth_surface():
     """A densely covered sphere: depth normals are its normals, whichever way the camera turns."""
     surfels = sphere_surfels(4000, scale=1.0, opacity_shift=3)
     arrays = surfels.numpy()
-    arrays |= {"rotations": rotation_from_normal(arrays["centers"]), "delta_normal": 0 * arrays["delta_normal"],
-               "curvature": 0 * arrays["curvature"]}
+    arrays |= {
+        "rotations": rotation_from_normal(arrays["centers"]),
+        "delta_normal": 0 * arrays["delta_normal"],
+        "curvature": 0 * arrays["curvature"],
+    }
     camera = orbit_camera(size=(96, 96))
     good = losses.depth_normal_consistency(render_gbuffer(Surfels.from_numpy(arrays, two_sided=False), camera), camera)[0]
     tilted = arrays | {"delta_normal": np.full((4000, 3), 0.7, np.float32)}
@@ -104,9 +107,12 @@ def test_normal_smoothness_equals_numpy(crease):
     inner[[0, -1]] = inner[:, [0, -1]] = False
     smooth = (roughness <= 0.5 * alpha)[..., 0]
     limited = lambda d2: d2 / (1 + d2 / crease**2) if crease else d2
-    pairs = np.concatenate([
-        limited(((np.roll(normal, -1, axis) - normal) ** 2).sum(-1))[inner & smooth & np.roll(smooth, -1, axis)]
-        for axis in (0, 1)])
+    pairs = np.concatenate(
+        [
+            limited(((np.roll(normal, -1, axis) - normal) ** 2).sum(-1))[inner & smooth & np.roll(smooth, -1, axis)]
+            for axis in (0, 1)
+        ]
+    )
     expected = 2 * pairs.mean()
     assert len(pairs) > 100
     assert losses.normal_smoothness(gbuffer, smooth, crease)[0] == pytest.approx(expected, rel=1e-4)
@@ -149,8 +155,11 @@ def test_distortion_is_the_sum_over_pairs():
     camera = Camera.look_at([0, 0, -4], [0, 0, 0], [0, 1, 0], 30, (8, 8))
     z, opacity = np.array([-0.3, 0.1, 0.2]), np.array([0.3, 0.5, 0.9])
     fields = sphere_surfels(3).numpy() | {
-        "centers": np.stack([0 * z, 0 * z, z], 1), "rotations": rotation_from_normal(np.tile([0.0, 0, -1], (3, 1))),
-        "scales": np.full((3, 2), 1e3), "opacities": opacity[:, None]}
+        "centers": np.stack([0 * z, 0 * z, z], 1),
+        "rotations": rotation_from_normal(np.tile([0.0, 0, -1], (3, 1))),
+        "scales": np.full((3, 2), 1e3),
+        "opacities": opacity[:, None],
+    }
     maps = render_gbuffer(Surfels.from_numpy(fields), camera, full=True).all
     w = opacity * np.concatenate([[1], np.cumprod(1 - opacity)[:-1]])
     expected = (w[:, None] * w * (z[:, None] - z) ** 2).sum()
@@ -165,6 +174,7 @@ def test_delta_normal_is_its_mean_length():
 
 
 # ---- The depth prior ----
+
 
 def depths(seed, n=400):
     """Rendered depths, a prior correlated with them, and where both are known."""
@@ -221,7 +231,7 @@ def test_pearson_depth_of_nothing_is_nothing(case):
         prior[:] = np.nan
     else:
         valid[:] = False
-        valid[:1 if case == "one" else 0] = True
+        valid[: 1 if case == "one" else 0] = True
     for inverse in (False, True):
         value, gradient = pearson(depth, prior, valid, inverse=inverse)
         assert value == 0 and np.all(gradient == 0)

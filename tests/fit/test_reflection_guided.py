@@ -46,14 +46,16 @@ def test_boxes_hold_components_and_no_specks():
 
 # ---- The literal construction ----
 
+
 def half_spaces(camera, box):
     """The pyramid behind a box as five half-spaces: (inward normals [5, 3], points on the planes [5, 3], whether the plane
     itself is outside [5]). Each side is spanned by the rays through two neighbouring corners; the last is what lies in
     front. A half-open box leaves out its right and bottom side."""
     x0, y0, x1, y1 = box
     (fx, fy), (cx, cy) = camera.focal, camera.principal
-    a, b, c, d = (camera.to_world[:3, :3] @ [(x - cx) / fx, (y - cy) / fy, 1]
-                  for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1)))
+    a, b, c, d = (
+        camera.to_world[:3, :3] @ [(x - cx) / fx, (y - cy) / fy, 1] for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))
+    )
     normals = [np.cross(a, b), np.cross(b, c), np.cross(c, d), np.cross(d, a), camera.to_world[:3, 2]]
     return np.array(normals), np.tile(camera.origin, (5, 1)), np.array([False, True, True, False, True])
 
@@ -124,6 +126,7 @@ def test_counting_views_is_intersecting_pyramids_on_their_very_sides():
 
 # ---- What it means ----
 
+
 def test_a_cluster_seen_by_boxes_is_guided():
     rng = np.random.default_rng(1)
     cluster, rest = rng.normal(size=(50, 3)) * 0.05, rng.uniform(1, 2, (50, 3)) * rng.choice([-1, 1], (50, 3))
@@ -164,5 +167,6 @@ def test_picture():
     rows, columns = np.nonzero(color(*reflection_guided.LINE))
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (160, 479, 240, 559)
     assert color(128, 128, 128).sum() == 640 * 800 - 320 * 320  # untouched outside the mask
-    assert reflection_guided.picture(np.zeros((80, 900, 3)), np.zeros((80, 900), bool), np.zeros((0, 4), int), camera,
-                          np.zeros((0, 3))).shape == (80, 900, 3)
+    assert reflection_guided.picture(
+        np.zeros((80, 900, 3)), np.zeros((80, 900), bool), np.zeros((0, 4), int), camera, np.zeros((0, 3))
+    ).shape == (80, 900, 3)

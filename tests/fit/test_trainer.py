@@ -215,8 +215,9 @@ def test_progress_and_bands_of_harmonics(dataset):
 
 
 def test_a_fit_that_is_stopped_is_shaded_by_what_has_begun(dataset):
-    settings = replace(SETTINGS, iterations=100, specular_start=0.2, indirect="one_bounce", indirect_start=0.4,
-                       monte_carlo_start=0.6)
+    settings = replace(
+        SETTINGS, iterations=100, specular_start=0.2, indirect="one_bounce", indirect_start=0.4, monte_carlo_start=0.6
+    )
     fit, begun = Fit(dataset, model(), settings, 1.0, Shading("monte_carlo")), []
     for fit.step_number in (10, 30, 50, 70):
         shading, indirect = fit.begun
@@ -259,8 +260,10 @@ def test_a_light_that_is_given_keeps_its_rows(dataset):
     np.testing.assert_array_equal(fit.model.numpy("log_environment"), model().numpy("log_environment"))
 
 
-@pytest.mark.parametrize("refine_start, downscale, most, rows", [
-    (0.5, 1, 512, 64), (0.6, 1, 512, 16), (0.5, 2, 512, 32), (0.5, 4, 512, 16), (0.5, 1, 63, 32)])
+@pytest.mark.parametrize(
+    "refine_start, downscale, most, rows",
+    [(0.5, 1, 512, 64), (0.6, 1, 512, 16), (0.5, 2, 512, 32), (0.5, 4, 512, 16), (0.5, 1, 63, 32)],
+)
 def test_environment_gets_the_rows_that_photographs_tell_apart(dataset, monkeypatch, refine_start, downscale, most, rows):
     """A mirror ball whose radius is 3/8 of 83 pixels has 49 of them from pole to pole (π r/2)."""
     monkeypatch.setattr(fit_module, "_MOST_ROWS", most)
@@ -312,7 +315,14 @@ def test_opacities_to_start_with(dataset, where, opacity):
     np.testing.assert_allclose(start(scene, data, settings).model.surfels(0).opacities.numpy(), 0.4, rtol=1e-5)
 
 
-@pytest.mark.parametrize("changes, surfels", [({"minutes": 8.0}, 50_000), ({"minutes": 30.0}, 150_000), (
-    {"minutes": None, "iterations": 10**6}, 50_000), ({"minutes": 30.0, "density": Density(max_surfels=7)}, 7)])
+@pytest.mark.parametrize(
+    "changes, surfels",
+    [
+        ({"minutes": 8.0}, 50_000),
+        ({"minutes": 30.0}, 150_000),
+        ({"minutes": None, "iterations": 10**6}, 50_000),
+        ({"minutes": 30.0, "density": Density(max_surfels=7)}, 7),
+    ],
+)
 def test_surfels_for_the_time(changes, surfels):
     assert replace(Settings(), **changes).max_surfels == surfels

@@ -13,9 +13,24 @@ from rgs_mi.surfels.surfels import CHANNELS, SH_0, Surfels, rotation_from_normal
 from scenes import orbit_camera, sphere_surfels
 
 ALL_AOVS = "depth,normal,albedo,roughness,metallic,alpha,specular,diffuse"
-AOV_CHANNELS = ["depth.T", "normal.X", "normal.Y", "normal.Z", "albedo.R", "albedo.G", "albedo.B", "roughness.Y",
-                "metallic.Y", "alpha.Y", "specular.R", "specular.G", "specular.B",
-                "diffuse.R", "diffuse.G", "diffuse.B"]
+AOV_CHANNELS = [
+    "depth.T",
+    "normal.X",
+    "normal.Y",
+    "normal.Z",
+    "albedo.R",
+    "albedo.G",
+    "albedo.B",
+    "roughness.Y",
+    "metallic.Y",
+    "alpha.Y",
+    "specular.R",
+    "specular.G",
+    "specular.B",
+    "diffuse.R",
+    "diffuse.G",
+    "diffuse.B",
+]
 XML = """<scene version="3.0.0">
   <default name="file" value="object.ply"/> <default name="format" value="rgb"/> <default name="spp" value="1"/>
   <integrator type="rgs_deferred"/>
@@ -63,10 +78,20 @@ def mirror_sphere(n, scale):
     """A closed, black metal sphere of ``n`` surfels with standard deviations ``scale``, almost a mirror."""
     x = fibonacci_sphere(n)
     full = lambda value, channels=1: np.full((n, channels), value)
-    return Surfels.from_numpy({
-        "centers": x, "rotations": rotation_from_normal(x), "scales": full(scale, 2), "opacities": full(0.95),
-        "sh": full(-0.5 / SH_0, 3), "base_color": full(1.0, 3), "roughness": full(0.05), "metallic": full(1.0),
-        "delta_normal": full(0.0, 3)}, two_sided=False)
+    return Surfels.from_numpy(
+        {
+            "centers": x,
+            "rotations": rotation_from_normal(x),
+            "scales": full(scale, 2),
+            "opacities": full(0.95),
+            "sh": full(-0.5 / SH_0, 3),
+            "base_color": full(1.0, 3),
+            "roughness": full(0.05),
+            "metallic": full(1.0),
+            "delta_normal": full(0.0, 3),
+        },
+        two_sided=False,
+    )
 
 
 def surfels_dict(surfels):
@@ -78,10 +103,17 @@ def scene_dict(surfels, camera=None, integrator=None, pixel_format="rgb", texels
     sensor = (camera or orbit_camera(size=(24, 20))).to_sensor_dict()
     sensor["film"]["pixel_format"] = pixel_format
     texels = smooth_environment() if texels is None else texels
-    return {"type": "scene", "integrator": {"type": "rgs_deferred", **(integrator or {})}, "sensor": sensor,
-            "object": surfels_dict(surfels) if surfels else {"type": "surfels"},
-            "environment": {"type": "envmap", "bitmap": mi.Bitmap(texels.astype(np.float32)),
-                            "to_world": to_world or mi.ScalarTransform4f().rotate([1, 0, 0], 90)}}
+    return {
+        "type": "scene",
+        "integrator": {"type": "rgs_deferred", **(integrator or {})},
+        "sensor": sensor,
+        "object": surfels_dict(surfels) if surfels else {"type": "surfels"},
+        "environment": {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(texels.astype(np.float32)),
+            "to_world": to_world or mi.ScalarTransform4f().rotate([1, 0, 0], 90),
+        },
+    }
 
 
 def load(*args, **kwargs):
@@ -94,16 +126,24 @@ def smooth_scene(**kwargs):
     n = 6
     normal = np.array([0.95, 0.3, 0.2]) + 0.06 * rng.normal(size=(n, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    surfels = Surfels.from_numpy({
-        "centers": np.linspace(-1, 1, n)[:, None] * [0.9, 0.3, 0.2] + 0.03 * rng.normal(size=(n, 3)),
-        "rotations": rotation_from_normal(normal, rng.uniform(0, 6, n)), "scales": rng.uniform(1.8, 2.6, (n, 2)),
-        "opacities": rng.uniform(0.3, 0.6, (n, 1)), "sh": 0.1 * rng.normal(size=(n, 12)),
-        "base_color": rng.uniform(0.3, 0.8, (n, 3)), "roughness": rng.uniform(0.42, 0.53, (n, 1)),
-        "metallic": rng.uniform(0.3, 0.7, (n, 1)), "delta_normal": 0.05 * rng.normal(size=(n, 3))})
+    surfels = Surfels.from_numpy(
+        {
+            "centers": np.linspace(-1, 1, n)[:, None] * [0.9, 0.3, 0.2] + 0.03 * rng.normal(size=(n, 3)),
+            "rotations": rotation_from_normal(normal, rng.uniform(0, 6, n)),
+            "scales": rng.uniform(1.8, 2.6, (n, 2)),
+            "opacities": rng.uniform(0.3, 0.6, (n, 1)),
+            "sh": 0.1 * rng.normal(size=(n, 12)),
+            "base_color": rng.uniform(0.3, 0.8, (n, 3)),
+            "roughness": rng.uniform(0.42, 0.53, (n, 1)),
+            "metallic": rng.uniform(0.3, 0.7, (n, 1)),
+            "delta_normal": 0.05 * rng.normal(size=(n, 3)),
+        }
+    )
     return load(surfels, orbit_camera(size=(14, 12), fov=25), **kwargs)
 
 
 # ---- Loading ----
+
 
 def test_load_file_finds_the_ply_beside_the_scene(ply, tmp_path, monkeypatch):
     (tmp_path / "scene.xml").write_text(XML)
@@ -149,22 +189,29 @@ def test_variants(ply):
         assert np.array_equal(mi.render(mi.load_string(XML, file=ply)).numpy(), expected)
 
 
-@pytest.mark.parametrize("shape, message", [
-    ('<string name="filenam" value="x.ply"/>', "filenam"),
-    ('<string name="filename" value="absent.ply"/>', "absent.ply: can't be read"),
-    ('<bsdf type="diffuse"/>', "surfels need 'principled'"),
-    ('<transform name="to_world"><scale value="2"/></transform>', "'to_world' is not supported"),
-])
+@pytest.mark.parametrize(
+    "shape, message",
+    [
+        ('<string name="filenam" value="x.ply"/>', "filenam"),
+        ('<string name="filename" value="absent.ply"/>', "absent.ply: can't be read"),
+        ('<bsdf type="diffuse"/>', "surfels need 'principled'"),
+        ('<transform name="to_world"><scale value="2"/></transform>', "'to_world' is not supported"),
+    ],
+)
 def test_bad_shapes(shape, message):
     with pytest.raises(RuntimeError, match=message):
         mi.load_string(f'<scene version="3.0.0"><shape type="surfels">{shape}</shape></scene>')
 
 
-@pytest.mark.parametrize("integrator, message", [
-    ({"specula": "none"}, "specula"), ({"specular": "nothing"}, "unknown specular 'nothing'"),
-    ({"indirect": "two"}, "unknown indirect 'two'"),
-    ({"aovs": "depth,colour"}, "unknown aov 'colour'"),
-])
+@pytest.mark.parametrize(
+    "integrator, message",
+    [
+        ({"specula": "none"}, "specula"),
+        ({"specular": "nothing"}, "unknown specular 'nothing'"),
+        ({"indirect": "two"}, "unknown indirect 'two'"),
+        ({"aovs": "depth,colour"}, "unknown aov 'colour'"),
+    ],
+)
 def test_bad_integrators(integrator, message):
     with pytest.raises(Exception, match=message):
         mi.load_dict({"type": "rgs_deferred", **integrator})
@@ -172,15 +219,19 @@ def test_bad_integrators(integrator, message):
 
 def test_scenes_that_cannot_be_rendered():
     base = scene_dict(sphere_surfels(4))
-    for change, message in [({"environment": None}, "no environment"), ({"object": {"type": "surfels"}}, "no surfels"),
-                            ({"sensor": {"type": "orthographic"}}, "'perspective'"),
-                            ({"environment": {"type": "sunsky"}}, "'envmap' or 'constant'")]:
+    for change, message in [
+        ({"environment": None}, "no environment"),
+        ({"object": {"type": "surfels"}}, "no surfels"),
+        ({"sensor": {"type": "orthographic"}}, "'perspective'"),
+        ({"environment": {"type": "sunsky"}}, "'envmap' or 'constant'"),
+    ]:
         scene = mi.load_dict({k: v for k, v in {**base, **change}.items() if v is not None})
         with pytest.raises(UserError, match=message):
             scene.integrator().render(scene)
 
 
 # ---- Images ----
+
 
 def test_crop_is_a_part_of_the_image():
     surfels = sphere_surfels(40)
@@ -192,8 +243,10 @@ def test_crop_is_a_part_of_the_image():
 
 def test_pixel_formats():
     surfels = sphere_surfels(40)
-    images = {f: mi.render(load(surfels, pixel_format=f, integrator={"hide_emitters": True})).numpy()
-              for f in ("rgb", "rgba", "luminance", "luminance_alpha", "xyz", "xyza")}
+    images = {
+        f: mi.render(load(surfels, pixel_format=f, integrator={"hide_emitters": True})).numpy()
+        for f in ("rgb", "rgba", "luminance", "luminance_alpha", "xyz", "xyza")
+    }
     rgb, alpha = images["rgb"], images["rgba"][..., 3:]
     assert alpha.min() < 0.05 and alpha.max() > 0.8 and np.all(rgb[alpha[..., 0] == 0] == 0)
     y = rgb @ np.float32([0.212671, 0.715160, 0.072169])
@@ -294,6 +347,7 @@ def test_depth_is_distance_along_the_ray():
 
 
 # ---- Shapes ----
+
 
 def test_rays_pass_without_proxies():
     scene = load(sphere_surfels(40))
@@ -477,8 +531,10 @@ def test_optimisation_with_nothing_but_mitsuba():
 def test_gradients_reach_what_parameters_are_made_of():
     scene = smooth_scene()
     params = mi.traverse(scene)
-    x = {"object.metallic": mi.TensorXf(np.zeros((6, 1), np.float32)),
-         "environment.data": mi.TensorXf(np.zeros(params["environment.data"].shape, np.float32))}
+    x = {
+        "object.metallic": mi.TensorXf(np.zeros((6, 1), np.float32)),
+        "environment.data": mi.TensorXf(np.zeros(params["environment.data"].shape, np.float32)),
+    }
     dr.enable_grad(x)
     for key, value in x.items():
         params[key] = dr.exp(value - 0.5)
@@ -491,16 +547,19 @@ def test_gradients_reach_what_parameters_are_made_of():
 
 # ---- Orientation ----
 
+
 @pytest.mark.parametrize("row, column", [(16, 12), (22, 30), (12, 20)])
 def test_reflections_lie_where_mitsuba_sees_them(row, column):
     texels = np.full((32, 64, 3), 0.02)
-    texels[row - 1:row + 2, column - 1:column + 2] = 5
+    texels[row - 1 : row + 2, column - 1 : column + 2] = 5
     to_world = mi.ScalarTransform4f().rotate([2 / 3, -1 / 3, 2 / 3], 70)
     setting = dict(camera=orbit_camera(size=(48, 48), fov=32), texels=texels, to_world=to_world, pixel_format="rgba")
     mine = scene_dict(mirror_sphere(30000, 0.011), integrator={"hide_emitters": True}, **setting)
     stock = scene_dict(None, integrator={"type": "path", "hide_emitters": True, "max_depth": 2}, **setting)
-    stock["object"] = {"type": "sphere", "bsdf": {
-        "type": "principled", "base_color": {"type": "rgb", "value": 1.0}, "roughness": 0.05, "metallic": 1.0}}
+    stock["object"] = {
+        "type": "sphere",
+        "bsdf": {"type": "principled", "base_color": {"type": "rgb", "value": 1.0}, "roughness": 0.05, "metallic": 1.0},
+    }
     grid, centroid, power = np.indices((48, 48)), [], []
     for scene, spp in ((mine, 16), (stock, 64)):
         image = mi.render(mi.load_dict(scene), spp=spp).numpy()

@@ -20,6 +20,7 @@ BATCHES = 8
 
 # ---- Crossings ----
 
+
 def brute_force(surfels, origin, direction, reach, leaves):
     """(8) of `rays.py` for each ray: (A, t, unit normal, roughness, weights [rays, N] in the order of the surfels)."""
     s = {name: value.astype(np.float64) for name, value in surfels.numpy().items()}
@@ -50,8 +51,9 @@ def brute_force(surfels, origin, direction, reach, leaves):
     return coverage, t_mean / some, mean / length, rough / some, weights
 
 
-@pytest.mark.parametrize("two_sided, leaves, reach",
-                         [(True, False, 10), (False, False, 10), (True, True, 10), (True, False, 1.5)])
+@pytest.mark.parametrize(
+    "two_sided, leaves, reach", [(True, False, 10), (False, False, 10), (True, True, 10), (True, False, 1.5)]
+)
 def test_rays_meet_what_brute_force_says(two_sided, leaves, reach):
     rng = np.random.default_rng(0)
     surfels = replace(sphere_surfels(150, scale=0.5), two_sided=two_sided)
@@ -94,6 +96,7 @@ def test_surfels_are_found_as_often_as_they_weigh():
 
 # ---- Pictures ----
 
+
 def plane(half=20, count=80, **fields):
     """A floor of surfels, z ≈ 0, so dense that nothing is seen through it. No two lie in one plane, as after a fit."""
     step, rng = 2 * half / count, np.random.default_rng(0)
@@ -102,26 +105,43 @@ def plane(half=20, count=80, **fields):
     n = len(centers)
     each = lambda v: np.tile(np.atleast_1d(np.float32(v)), (n, 1))
     values = {"sh": (np.zeros(3) - 0.5) / SH_0, "base_color": (0.6, 0.3, 0.2), "roughness": 0.3, "metallic": 0.3} | fields
-    return Surfels.from_numpy({"centers": centers, "rotations": rotation_from_normal(np.tile([0.0, 0, 1], (n, 1))),
-                               "scales": each([step, step]), "opacities": each(0.99), "delta_normal": each([0, 0, 0])}
-                              | {name: each(value) for name, value in values.items()})
+    return Surfels.from_numpy(
+        {
+            "centers": centers,
+            "rotations": rotation_from_normal(np.tile([0.0, 0, 1], (n, 1))),
+            "scales": each([step, step]),
+            "opacities": each(0.99),
+            "delta_normal": each([0, 0, 0]),
+        }
+        | {name: each(value) for name, value in values.items()}
+    )
 
 
 def shapes():
     """What stands on the floor: a mirror, something to throw a shadow, a lamp."""
     ball = lambda x, y, r, bsdf: {"type": "sphere", "center": [x, y, 1.3], "radius": r, "bsdf": bsdf}
-    return {"mirror": ball(-1, 0, 1, {"type": "conductor", "material": "none"}),
-            "ball": ball(1.2, -0.5, 0.6, {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.7]}}),
-            "lamp": {"type": "sphere", "center": [2, 2, 4], "radius": 0.5,
-                     "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [12, 10, 8]}}},
-            "sky": {"type": "constant", "radiance": 0.3}}
+    return {
+        "mirror": ball(-1, 0, 1, {"type": "conductor", "material": "none"}),
+        "ball": ball(1.2, -0.5, 0.6, {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.7]}}),
+        "lamp": {
+            "type": "sphere",
+            "center": [2, 2, 4],
+            "radius": 0.5,
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [12, 10, 8]}},
+        },
+        "sky": {"type": "constant", "radiance": 0.3},
+    }
 
 
 def estimate(scene, integrator, first):
     sensor = mi.load_dict(Camera.look_at([0, -7, 4], [0, 0, 0.6], [0, 0, 1], 45, (28, 20)).to_sensor_dict())
     scene, integrator = mi.load_dict({"type": "scene"} | scene), mi.load_dict(integrator)
-    return Estimate.of([mi.render(scene, sensor=sensor, integrator=integrator, spp=64, seed=first + k).numpy()
-                        [..., :3].reshape(-1, 3) for k in range(BATCHES)])
+    return Estimate.of(
+        [
+            mi.render(scene, sensor=sensor, integrator=integrator, spp=64, seed=first + k).numpy()[..., :3].reshape(-1, 3)
+            for k in range(BATCHES)
+        ]
+    )
 
 
 def surfel_shape(surfels):
@@ -129,8 +149,13 @@ def surfel_shape(surfels):
 
 
 def rectangle(**more):
-    bsdf = {"type": "principled", "base_color": {"type": "rgb", "value": [0.6, 0.3, 0.2]}, "roughness": 0.3, "metallic": 0.3,
-            "eta": 1.5} | more.pop("bsdf", {})
+    bsdf = {
+        "type": "principled",
+        "base_color": {"type": "rgb", "value": [0.6, 0.3, 0.2]},
+        "roughness": 0.3,
+        "metallic": 0.3,
+        "eta": 1.5,
+    } | more.pop("bsdf", {})
     return {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale([20, 20, 1]), "bsdf": bsdf} | more
 
 
@@ -168,16 +193,19 @@ def test_emitters_hide_and_coverage_is_alpha():
     surfels = sphere_surfels(300)
     sensor = mi.load_dict(sensor_dict(Camera.look_at([0, -4, 0], [0, 0, 0], [0, 0, 1], 40, (24, 24))))
     scene = mi.load_dict({"type": "scene", "object": surfel_shape(surfels), "sky": {"type": "constant"}})
+
     def picture(kind, **more):
         return mi.render(scene, sensor=sensor, integrator=mi.load_dict({"type": kind, **more}), spp=256).numpy()
+
     hidden, shown = (picture("rgs_path", hide_emitters=value) for value in (True, False))
     assert (shown[..., 3] == 1).all() and hidden[0, 0, 3] == 0 and (hidden[0, 0, :3] == 0).all()
     splatted = picture("rgs_deferred", specular="none", hide_emitters=True)
     assert abs(hidden[..., 3] - splatted[..., 3]).mean() < 0.02  # whose low-pass widens small surfels
 
 
-@pytest.mark.parametrize("change, message", [({"diffuse": "no"}, "unknown diffuse 'no'"),
-                                             ({"max_depth": -3}, "max_depth -3")])
+@pytest.mark.parametrize(
+    "change, message", [({"diffuse": "no"}, "unknown diffuse 'no'"), ({"max_depth": -3}, "max_depth -3")]
+)
 def test_bad_settings(change, message):
     with pytest.raises(Exception, match=message):
         mi.load_dict({"type": "rgs_path"} | change)

@@ -39,8 +39,9 @@ def hits(camera, centre=CENTRE, radius=RADIUS):
 def photograph(camera, **sphere):
     """[H, W, 4] uint8: the sphere with an antialiased mask."""
     fine = camera.resized(*(OVERSAMPLING * n for n in camera.size))
-    alpha = np.isfinite(hits(fine, **sphere)).reshape(
-        camera.size[1], OVERSAMPLING, camera.size[0], OVERSAMPLING).mean((1, 3))
+    alpha = (
+        np.isfinite(hits(fine, **sphere)).reshape(camera.size[1], OVERSAMPLING, camera.size[0], OVERSAMPLING).mean((1, 3))
+    )
     pixels = np.zeros((*alpha.shape, 4), np.uint8)
     pixels[..., :3], pixels[..., 3] = RGB, np.round(255 * alpha)
     return pixels
@@ -139,8 +140,14 @@ def test_coarse_to_fine_skips_nothing(data):
 def test_object_that_fills_the_frame(size, count, peak, centre):
     """As `rgs_mi.datasets.path_traced` photographs objects: space that no frame shows is carved all the same."""
     centre, distance = np.array(centre, float), path_traced.MARGIN / np.sin(np.radians(path_traced.FOV / 2))
-    views = views_of([Camera.look_at(centre + distance * d, centre, (0, 0, 1), path_traced.FOV, (size, size))
-                      for d in path_traced.train_directions(count)], centre=centre, radius=1)
+    views = views_of(
+        [
+            Camera.look_at(centre + distance * d, centre, (0, 0, 1), path_traced.FOV, (size, size))
+            for d in path_traced.train_directions(count)
+        ],
+        centre=centre,
+        radius=1,
+    )
     lower, upper = hull.object_box(views)
     assert (lower < centre - 0.95).all() and (upper > centre + 0.95).all() and (upper - lower).max() < 2.5
     vertices, _, _ = hull.surface(hull.visual_hull(views, 80))
@@ -168,8 +175,7 @@ def test_only_a_border_that_the_mask_touches_is_undecided():
 
 def test_views_that_lose_the_object_do_not_carve_it(data):
     """Close-ups that show a part of the sphere leave the rest of it alone."""
-    close = views_of([Camera.look_at(c.origin, CENTRE + [0.3, 0.3, 0], (0, 0, 1), 12, (SIZE, SIZE))
-                      for c in around()[::10]])
+    close = views_of([Camera.look_at(c.origin, CENTRE + [0.3, 0.3, 0], (0, 0, 1), 12, (SIZE, SIZE)) for c in around()[::10]])
     assert any(v.pixels[:, 0, 3].any() or v.pixels[0, :, 3].any() for v in close)
     vertices, _, _ = hull.surface(hull.visual_hull(data.train + close, 64))
     distance = np.linalg.norm(vertices - CENTRE, axis=1)
@@ -220,6 +226,7 @@ def test_no_masks_and_no_common_volume(data):
 
 
 # ---- Initial points ----
+
 
 def test_initial_points_from_masks(data):
     positions, normals, colors, spacing = initial_points(data, 1500, 0)

@@ -51,6 +51,7 @@ def fails(match, *args, **options):
 
 # ---- The interface ----
 
+
 def test_names_and_options():
     assert NAMES == ("hull", "stereo", "files", "vggt", "none") and depth_priors("none", [view()]) is None
     fails("prior 'depth' is unknown: choose one of hull, stereo, files, vggt, none", "depth", [])
@@ -72,6 +73,7 @@ def test_hull(name):
 
 # ---- Maps ----
 
+
 def test_inside_and_outlined():
     v = view()
     values = np.ones(SIZE[::-1])
@@ -85,6 +87,7 @@ def test_inside_and_outlined():
 @pytest.mark.parametrize("shape", [(80, 96), (20, 24), (33, 40), (1, 1)])
 def test_resize_keeps_planes_and_borders(shape):
     """A plane in the image stays that plane, whatever the grid, except within half a pixel of the border."""
+
     def plane(height, width):
         x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
         return 2 + x - 3 * y
@@ -105,6 +108,7 @@ def test_resize_does_not_spread_the_unknown():
 
 
 # ---- Files ----
+
 
 def write_exr(path, **channels):
     import OpenEXR
@@ -138,7 +142,7 @@ def test_files_of_all_kinds(tmp_path, kind):
     for path in tmp_path.glob("*.NPY.npy"):
         path.rename(tmp_path / "r_0.NPY")
     np.savez(tmp_path / "r_1.npz", other)
-    prior, = depth_priors("files", [v], folder=tmp_path)
+    (prior,) = depth_priors("files", [v], folder=tmp_path)
     expected = np.where(maps.inside(v) & (depth > 0), depth, np.nan)
     np.testing.assert_array_equal(prior.values, expected)
     assert prior.values.dtype == np.float32 and np.isfinite(prior.values).any() and prior.confidence is None
@@ -165,9 +169,14 @@ def test_what_is_wrong_with_files_is_said_in_a_line(tmp_path):
     np.savez(tmp_path / "r_0.npz", np.ones((40, 48)))
     fails("r_0.npy and r_0.npz are there.*leave one", "files", views, folder=tmp_path)
     (tmp_path / "r_0.npz").unlink()
-    for array, reason in ((np.ones((48, 40)), "is 40 x 48, its photograph 48 x 40"), (np.ones((40, 48, 3)), "40 x 48 x 3"),
-                          (np.float32(3), "a single number"), (np.ones((0, 4)), "0 x 4"),
-                          (np.full((40, 48), 1j), "complex128"), (np.full((40, 48), None), "[Oo]bject arrays")):
+    for array, reason in (
+        (np.ones((48, 40)), "is 40 x 48, its photograph 48 x 40"),
+        (np.ones((40, 48, 3)), "40 x 48 x 3"),
+        (np.float32(3), "a single number"),
+        (np.ones((0, 4)), "0 x 4"),
+        (np.full((40, 48), 1j), "complex128"),
+        (np.full((40, 48), None), "[Oo]bject arrays"),
+    ):
         np.save(tmp_path / "r_0.npy", array, allow_pickle=True)
         fails(f"r_0.npy.*{reason}", "files", views, folder=tmp_path)
 
@@ -178,9 +187,13 @@ def test_damaged_files(tmp_path, name, content):
     path = tmp_path / name
     if content == "half":
         depth = np.random.default_rng(0).integers(1, 60000, SIZE[::-1]).astype(np.float32)
-        {".npz": lambda: np.savez(path, depth), ".npy": lambda: np.save(path, depth),
-         ".exr": lambda: write_exr(path, Z=depth), ".png": lambda: write_png(path, depth)}[path.suffix]()
-        content = path.read_bytes()[:path.stat().st_size // 2]
+        {
+            ".npz": lambda: np.savez(path, depth),
+            ".npy": lambda: np.save(path, depth),
+            ".exr": lambda: write_exr(path, Z=depth),
+            ".png": lambda: write_png(path, depth),
+        }[path.suffix]()
+        content = path.read_bytes()[: path.stat().st_size // 2]
     path.write_bytes(content)
     fails(f"{name} cannot be read as a depth map", "files", [view()], folder=tmp_path)
 
@@ -194,6 +207,7 @@ def test_files_of_the_wrong_sort(tmp_path):
 
 
 # ---- The cache ----
+
 
 def test_cache_is_found_by_content(tmp_path, monkeypatch):
     calls = []
@@ -212,7 +226,7 @@ def test_cache_is_found_by_content(tmp_path, monkeypatch):
     again, count = estimate([View("else", v.camera, v.pixels.copy(), True, None, tmp_path) for v in views], resolution=20)
     assert count == 0
     np.testing.assert_array_equal(first, again)
-    file, = (tmp_path / "priors").iterdir()
+    (file,) = (tmp_path / "priors").iterdir()
     assert file.name.startswith("hull-") and file.suffix == ".npz"
 
     pixels = views[0].pixels.copy()
@@ -242,6 +256,7 @@ def test_a_cache_that_cannot_be_written_costs_only_itself(tmp_path):
 
 # ---- VGGT, what needs no torch ----
 
+
 @pytest.mark.parametrize("count", [0, 1, 2, 5, 6, 7, 16, 17, 80, 81])
 @pytest.mark.parametrize("batch, overlap", [(2, 1), (6, 1), (6, 5), (16, 4), (24, 6)])
 def test_batches(count, batch, overlap):
@@ -264,14 +279,23 @@ def test_scale_is_a_weighted_median():
 def test_missing_packages(monkeypatch, missing):
     for name, module in {"torch": types.ModuleType("torch"), "vggt": types.ModuleType("vggt"), missing: None}.items():
         monkeypatch.setitem(sys.modules, name, module)
-    fails("vggt prior needs packages.*pip install torch.*git.https://github.com/facebookresearch/vggt; "
-          "the priors hull, files and none", "vggt", [view()])
+    fails(
+        "vggt prior needs packages.*pip install torch.*git.https://github.com/facebookresearch/vggt; "
+        "the priors hull, files and none",
+        "vggt",
+        [view()],
+    )
 
 
 def test_missing_weights_and_wrong_options(tmp_path):
     for weights in (tmp_path / "model.pt", tmp_path, "models/model.safetensors"):
-        fails("VGGT's weights .*model.* do not exist: give a model.pt.*hull, files and none", "vggt", [view()],
-              weights=weights, cache=tmp_path)
+        fails(
+            "VGGT's weights .*model.* do not exist: give a model.pt.*hull, files and none",
+            "vggt",
+            [view()],
+            weights=weights,
+            cache=tmp_path,
+        )
     for batch, overlap in ((4, 4), (4, 0), (0, 0)):
         fails("overlap must be at least 1 and less than batch", "vggt", [view()], batch=batch, overlap=overlap)
 
@@ -288,6 +312,7 @@ def test_fingerprint(tmp_path):
 
 
 # ---- VGGT, with a network of its interface ----
+
 
 @pytest.fixture
 def network(monkeypatch):
@@ -323,12 +348,20 @@ def network(monkeypatch):
             assert patches.shape == (b, s, h // 14 * (w // 14), 3)
             depth = (self.offset - images.mean(2)) * (1 + patches[:, :1].mean())
             if record.corrupt:
-                depth[:, :, h // 2:h // 2 + 20] = torch.inf
+                depth[:, :, h // 2 : h // 2 + 20] = torch.inf
             return depth[..., None], 1 + images[:, :, 0]
 
     class VGGT(torch.nn.Module):
-        def __init__(self, img_size=518, patch_size=14, embed_dim=1024, enable_camera=True, enable_point=True,
-                     enable_depth=True, enable_track=True):
+        def __init__(
+            self,
+            img_size=518,
+            patch_size=14,
+            embed_dim=1024,
+            enable_camera=True,
+            enable_point=True,
+            enable_depth=True,
+            enable_track=True,
+        ):
             super().__init__()
             self.aggregator, self.depth_head = Aggregator(), DepthHead()
             self.camera_head, self.point_head, self.track_head = (torch.nn.Linear(2, 2) for _ in range(3))
@@ -354,16 +387,24 @@ def network(monkeypatch):
                 size = 518, round(height * (518 / width) / 14) * 14
             pixels = np.float32(image.resize(size, Image.Resampling.BICUBIC)) / 255
             if mode == "crop" and size[1] > 518:
-                pixels = pixels[(size[1] - 518) // 2:][:518]
+                pixels = pixels[(size[1] - 518) // 2 :][:518]
             if mode == "pad":
                 rows, columns = 518 - size[1], 518 - size[0]
-                pixels = np.pad(pixels, ((rows // 2, rows - rows // 2), (columns // 2, columns - columns // 2), (0, 0)),
-                                constant_values=1)
+                pixels = np.pad(
+                    pixels,
+                    ((rows // 2, rows - rows // 2), (columns // 2, columns - columns // 2), (0, 0)),
+                    constant_values=1,
+                )
             images.append(torch.from_numpy(pixels).permute(2, 0, 1))
         return torch.stack(images)
 
-    for name, content in {"vggt": {}, "vggt.models": {}, "vggt.models.vggt": {"VGGT": VGGT}, "vggt.utils": {},
-                          "vggt.utils.load_fn": {"load_and_preprocess_images": load_and_preprocess_images}}.items():
+    for name, content in {
+        "vggt": {},
+        "vggt.models": {},
+        "vggt.models.vggt": {"VGGT": VGGT},
+        "vggt.utils": {},
+        "vggt.utils.load_fn": {"load_and_preprocess_images": load_and_preprocess_images},
+    }.items():
         module = types.ModuleType(name)
         vars(module).update(content)
         monkeypatch.setitem(sys.modules, name, module)
@@ -384,8 +425,16 @@ def expected(v, scale):
     return np.where(maps.inside(v), scale * (3 - v.pixels[..., 0] / 255.0), np.nan)
 
 
-@pytest.mark.parametrize("sizes, mode", [([(48, 40)] * 3, "crop"), ([(40, 40)] * 2, "crop"), ([(700, 400)], "crop"),
-                                         ([(40, 71)] * 2, "pad"), ([(48, 40), (40, 48), (60, 31)], "pad")])
+@pytest.mark.parametrize(
+    "sizes, mode",
+    [
+        ([(48, 40)] * 3, "crop"),
+        ([(40, 40)] * 2, "crop"),
+        ([(700, 400)], "crop"),
+        ([(40, 71)] * 2, "pad"),
+        ([(48, 40), (40, 48), (60, 31)], "pad"),
+    ],
+)
 def test_vggt_maps_lie_on_the_photographs(network, sizes, mode):
     """Whatever was resized, padded or rounded to patches is undone: depths are where their pixels are."""
     views = [shaded(f"{i}", size, masked=False) for i, size in enumerate(sizes)]
@@ -429,7 +478,7 @@ def test_vggt_batches_are_brought_to_one_scale(network):
 
 def test_vggt_leaves_out_what_is_not_finite(network):
     network.corrupt = True
-    prior, = depth_priors("vggt", [shaded("0", (48, 40))])
+    (prior,) = depth_priors("vggt", [shaded("0", (48, 40))])
     lost = maps.inside(view()) & np.isnan(prior.values)
     assert 0 < lost.sum() <= 144 and np.all(prior.confidence[lost] == 0) and not np.isinf(prior.values).any()
 
@@ -447,7 +496,7 @@ def test_vggt_local_weights(network, tmp_path, name):
         pytest.importorskip("safetensors.torch").save_file(state, tmp_path / name)
     v = shaded("0", (48, 40), masked=False)
     for weights in (tmp_path / name, tmp_path):
-        prior, = depth_priors("vggt", [v], weights=weights)
+        (prior,) = depth_priors("vggt", [v], weights=weights)
         assert np.ptp(prior.values / (6 - v.pixels[..., 0] / 255.0)) < 0.02
     assert network.hub == []
 
@@ -455,8 +504,13 @@ def test_vggt_local_weights(network, tmp_path, name):
 def test_vggt_weights_that_cannot_be_loaded(network, tmp_path):
     import torch
 
-    fails(r"weights someone/else cannot be loaded \(We couldn't connect to the hub to load the files\): check the network.*"
-          "hull, files and none", "vggt", [view()], weights="someone/else")
+    fails(
+        r"weights someone/else cannot be loaded \(We couldn't connect to the hub to load the files\): check the network.*"
+        "hull, files and none",
+        "vggt",
+        [view()],
+        weights="someone/else",
+    )
     path = tmp_path / "model.pt"
     path.write_bytes(b"nothing")
     fails("model.pt cannot be loaded.*download it again", "vggt", [view()], weights=path)

@@ -25,22 +25,29 @@ def panel(centre, u, v, contrast, seed):
     """A rectangle that shines with a `texture`, to the side of u × v."""
     matrix = np.eye(4)
     matrix[:3] = np.stack([u, v, np.cross(u, v) / np.linalg.norm(np.cross(u, v)), centre], 1)
-    return {"type": "rectangle", "to_world": mi.ScalarTransform4f(matrix.tolist()),
-            "bsdf": {"type": "diffuse", "reflectance": 0.0},
-            "emitter": {"type": "area", "radiance": {"type": "bitmap", "bitmap": texture(contrast, seed), "raw": True}}}
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f(matrix.tolist()),
+        "bsdf": {"type": "diffuse", "reflectance": 0.0},
+        "emitter": {"type": "area", "radiance": {"type": "bitmap", "bitmap": texture(contrast, seed), "raw": True}},
+    }
 
 
 def tray(contrast):
     """A box that is open above, with a floor at half its height."""
-    shapes = {"floor": panel([0, 0, FLOOR], [INNER, 0, 0], [0, INNER, 0], contrast, 1),
-              "below": panel([0, 0, -RIM], [0, HALF, 0], [HALF, 0, 0], contrast, 2)}
+    shapes = {
+        "floor": panel([0, 0, FLOOR], [INNER, 0, 0], [0, INNER, 0], contrast, 1),
+        "below": panel([0, 0, -RIM], [0, HALF, 0], [HALF, 0, 0], contrast, 2),
+    }
     up, middle, wall = np.array([0, 0, 1.0]), (INNER + HALF) / 2, (HALF - INNER) / 2
     height, depth = (RIM + FLOOR) / 2 * up, (RIM - FLOOR) / 2 * up
     for k, (x, y) in enumerate([(1, 0), (-1, 0), (0, 1), (0, -1)]):
         out, side = np.array([x, y, 0.0]), np.array([-y, x, 0.0])
-        shapes |= {f"outer{k}": panel(HALF * out, HALF * side, RIM * up, contrast, 10 + k),
-                   f"inner{k}": panel(INNER * out + height, depth, INNER * side, contrast, 20 + k),
-                   f"rim{k}": panel(middle * out + RIM * up, wall * out, HALF * side, contrast, 30 + k)}
+        shapes |= {
+            f"outer{k}": panel(HALF * out, HALF * side, RIM * up, contrast, 10 + k),
+            f"inner{k}": panel(INNER * out + height, depth, INNER * side, contrast, 20 + k),
+            f"rim{k}": panel(middle * out + RIM * up, wall * out, HALF * side, contrast, 30 + k),
+        }
     return shapes
 
 
@@ -67,8 +74,16 @@ def photographs(shapes, distance=2.2):
         sensor["film"] |= {"pixel_format": "rgba"}
         image = np.array(mi.render(scene, sensor=mi.load_dict(sensor), spp=16, seed=i))
         color = np.clip(image[..., :3] / np.maximum(image[..., 3:], 1e-6), 0, 1)
-        views.append(View(str(i), camera, np.uint8(255 * np.concatenate([color, image[..., 3:].clip(0, 1)], -1) + 0.5), True,
-                          None, None))
+        views.append(
+            View(
+                str(i),
+                camera,
+                np.uint8(255 * np.concatenate([color, image[..., 3:].clip(0, 1)], -1) + 0.5),
+                True,
+                None,
+                None,
+            )
+        )
     return views
 
 
@@ -114,6 +129,7 @@ def test_a_mirror_stays():
 
 def test_what_is_cut_off_a_fine_hull_is_what_the_rough_one_lost():
     """A ball on a grid, a half-space on a coarser one that does not share its nodes: their intersection."""
+
     def grid(lower, step, count, value):
         x, y, z = lower + step * np.indices((count,) * 3)
         return hull.SignedField(value(x, y, z).astype(np.float32), np.full(3, lower), step)
@@ -151,14 +167,15 @@ def test_alikeness_is_what_loops_say():
     inner = np.argwhere(ndimage.binary_erosion(np.isfinite(depths[0]), iterations=4))
     for row, column in inner[rng.permutation(len(inner))[:25]]:
         for k, below in enumerate(level):
-            scores = [correlation(small[0], depths[0] + below, *pair, row, column, margin)
-                      for pair in zip(small[1:], depths[1:])]
+            scores = [
+                correlation(small[0], depths[0] + below, *pair, row, column, margin) for pair in zip(small[1:], depths[1:])
+            ]
             assert mine[k, row, column] == pytest.approx(np.mean(sorted(scores)[-3:]), abs=2e-3)
 
 
 def correlation(here, depth, other, surface, row, column, margin):
     """Of the 5 × 5 pixels around one of ``here``, at ``depth``, and what ``other`` shows there."""
-    rows, columns = np.mgrid[row - 2:row + 3, column - 2:column + 3]
+    rows, columns = np.mgrid[row - 2 : row + 3, column - 2 : column + 3]
     points = here.camera.origin + here.camera.rays()[rows, columns].reshape(-1, 3) * depth[rows, columns].reshape(-1, 1)
     pixel, z = other.camera.project(points)
     pixel = pixel - 0.5

@@ -24,8 +24,13 @@ import browser
 from scenes import orbit_camera
 
 FIGURES = ("surfels", "render_fps", "train_seconds", "iterations", "peak_rss_mb")
-SMALL = ["iterations=12", "start.surfels=300", "checkpoint_seconds=0", "stages=[{until: 0.5, downscale: 2}, {views: 2}]",
-         "minutes=null"]
+SMALL = [
+    "iterations=12",
+    "start.surfels=300",
+    "checkpoint_seconds=0",
+    "stages=[{until: 0.5, downscale: 2}, {views: 2}]",
+    "minutes=null",
+]
 
 
 class Parsed(HTMLParser):
@@ -82,6 +87,7 @@ def metrics(run):
 
 # ---- The page of a run ----
 
+
 def test_figures_are_those_of_metrics(run):
     """Every number once or more, in full in the data element, and rounded before the reader's eyes."""
     figures, parsed = metrics(run), Parsed((run / report.REPORT).read_text())
@@ -107,8 +113,18 @@ def test_nothing_comes_from_outside(run):
 def test_pictures_say_what_they_are(run):
     pictures = Parsed((run / report.REPORT).read_text()).pictures
     assert all(pictures) and len(set(pictures)) == len(pictures)
-    for kind in ("normals", "true normals", "normal error", "error", "diffuse", "specular", "roughness", "metallic",
-                 "base color", "depth"):
+    for kind in (
+        "normals",
+        "true normals",
+        "normal error",
+        "error",
+        "diffuse",
+        "specular",
+        "roughness",
+        "metallic",
+        "base color",
+        "depth",
+    ):
         assert f"{kind} of view r_1" in pictures
 
 
@@ -142,6 +158,7 @@ def test_a_stopped_fit_says_so(run, tmp_path):
 
 # ---- Curves ----
 
+
 def test_curves_of_a_run(run):
     lines = (run / "curves.csv").read_text().splitlines()
     rows = [dict(zip(lines[0].split(","), line.split(","))) for line in lines[1:]]
@@ -154,8 +171,9 @@ def test_curves_of_a_run(run):
 
 def test_curves_average_stretches():
     curves, steps = Curves(), 10 * STRETCHES
-    complete = [curves.add(k / steps, {"step": k}, {"psnr": float(k), "ms": float("nan") if k % 2 else 1.0})
-                for k in range(steps)]
+    complete = [
+        curves.add(k / steps, {"step": k}, {"psnr": float(k), "ms": float("nan") if k % 2 else 1.0}) for k in range(steps)
+    ]
     assert len(curves.rows) == sum(complete) == STRETCHES and curves.rows[-1]["step"] == steps - 10
     assert curves.rows[2] == {"step": 20, "psnr": np.mean(range(11, 21)), "ms": 1.0}
 
@@ -193,6 +211,7 @@ def test_plots():
 
 # ---- Pictures ----
 
+
 def test_normal_error_has_the_angle():
     """The mean over the picture's degrees is the figure of metrics.json."""
     rng = np.random.default_rng(0)
@@ -203,8 +222,10 @@ def test_normal_error_has_the_angle():
     assert np.abs(np.diff(angles[1].mean(-1))).max() < 2  # no steps
     assert (np.diff(angles[1] @ [0.2126, 0.7152, 0.0722]) < 0).all()  # the larger the darker
     view = View("v", orbit_camera(0, size=(20, 20)), np.full((20, 20, 4), 255, np.uint8), False, truth, None)
-    maps = {name: np.zeros((20, 20, 1 if name in ("roughness", "metallic", "depth") else 3)) for name in
-            ("color", "diffuse", "specular", "base_color", "roughness", "metallic", "depth")} | {"normal": normal}
+    maps = {
+        name: np.zeros((20, 20, 1 if name in ("roughness", "metallic", "depth") else 3))
+        for name in ("color", "diffuse", "specular", "base_color", "roughness", "metallic", "depth")
+    } | {"normal": normal}
     shown = panels(view, Rendering(np.ones((20, 20, 3)), np.ones((20, 20, 1)), maps), 1.0)["normal error"]
     assert (shown[:5] == 255).all()
     nearest = np.abs(shown[5:, :, None].astype(float) - angles[1]).sum(-1).argmin(-1) / 255 * NORMAL_RANGE
@@ -228,12 +249,18 @@ def test_rgbe():
 
 # ---- The page of a suite ----
 
+
 def test_suite(run, tmp_path):
     damaged, outside = tmp_path / "damaged", tmp_path / "suite" / "suite.html"
     damaged.mkdir()
     (damaged / "metrics.json").write_text('{"psnr": 3')
-    runs = [("ball", run, None), ("again", run, None), ("gone", None, "it <failed>"), ("damaged", damaged, None),
-            ("nothing", None, None)]
+    runs = [
+        ("ball", run, None),
+        ("again", run, None),
+        ("gone", None, "it <failed>"),
+        ("damaged", damaged, None),
+        ("nothing", None, None),
+    ]
     report.write_suite(outside, runs, "Suite")
     text = outside.read_text()
     parsed, figures = Parsed(text), metrics(run)
@@ -247,22 +274,26 @@ def test_suite(run, tmp_path):
 
 # ---- TensorBoard ----
 
+
 def test_event_files(run):
     from tensorboardX.proto.event_pb2 import Event
 
-    path, = (run / "tensorboard").glob("events.out.tfevents.*")
+    (path,) = (run / "tensorboard").glob("events.out.tfevents.*")
     data, events = path.read_bytes(), []
     while data:
         length = int.from_bytes(data[:8], "little")
-        events.append(Event.FromString(data[12:12 + length]))
-        data = data[16 + length:]
+        events.append(Event.FromString(data[12 : 12 + length]))
+        data = data[16 + length :]
     scalars = {(event.step, value.tag): value.simple_value for event in events for value in event.summary.value}
     lines = (run / "curves.csv").read_text().splitlines()
     names = lines[0].split(",")
     for line in lines[1:]:
         row = dict(zip(names, map(float, line.split(","))))
-        assert all(scalars.pop((row["step"], name.replace(".", "/"))) == pytest.approx(value)
-                   for name, value in row.items() if name != "step")
+        assert all(
+            scalars.pop((row["step"], name.replace(".", "/"))) == pytest.approx(value)
+            for name, value in row.items()
+            if name != "step"
+        )
     assert not scalars
 
 
@@ -295,8 +326,13 @@ def test_in_a_browser(run, tmp_path):
     environment = np.exp(np.random.default_rng(2).normal(size=(8, 16, 3)) * 2)
     environment[0, 0] = 0
     views = [{name: np.full((64, 64, 3), 40 * k, np.uint8) for k, name in enumerate(("photograph", "rendering", "error"))}]
-    report.write(tmp_path, metrics(run), Curves([{"seconds": 1.0, "pixels": 9, "surfels": 5, "ms": 1.0, "psnr": 9.0}]),
-                 {"r_0": views[0]}, environment)
+    report.write(
+        tmp_path,
+        metrics(run),
+        Curves([{"seconds": 1.0, "pixels": 9, "surfels": 5, "ms": 1.0, "psnr": 9.0}]),
+        {"r_0": views[0]},
+        environment,
+    )
     with browser.Browser(browser.find()) as chromium:
         assert chromium.open(run / report.REPORT) < 5  # seconds; a tenth of it on an idle machine
         assert chromium.run("[...document.images].every(image => image.complete && image.naturalWidth > 0)")

@@ -53,6 +53,7 @@ def load(tmp_path):
             paths.append(tmp_path / f"{i}.yaml")
             paths[-1].write_text(text)
         return load_config(Settings, paths, overrides)
+
     return load
 
 
@@ -63,8 +64,11 @@ def test_defaults():
 
 
 def test_merge(load):
-    settings = load("steps: 7\nrates: {opacity: 0.2}\nmask: false", "rates:\n  opacity: 0.3\nname: b\n",
-                    overrides=["steps=9", "size=[3, 4]"])
+    settings = load(
+        "steps: 7\nrates: {opacity: 0.2}\nmask: false",
+        "rates:\n  opacity: 0.3\nname: b\n",
+        overrides=["steps=9", "size=[3, 4]"],
+    )
     assert settings == Settings(steps=9, mask=False, name="b", size=(3, 4), rates=Rates(0.5, 0.3))
 
 
@@ -72,66 +76,72 @@ def test_empty(load):
     assert load("", "# nothing\n", "rates:\n  # position: 1\n") == Settings()
 
 
-@pytest.mark.parametrize("text, name, value", [
-    ("rates: {position: 1e-3}", "rates", Rates(1e-3)),
-    ("rates: {position: 1}", "rates", Rates(1.0)),
-    ("rates: {position: .inf}", "rates", Rates(math.inf)),
-    (f"rates: {{position: {'9' * 400}}}", "rates", Rates(math.inf)),
-    ("steps: 3e4", "steps", 30000),
-    ("name: off", "name", "off"),
-    ("name: 1:30", "name", "1:30"),
-    ("specular: off", "specular", "off"),
-    ("weights: [1, 2.5, 1e-3]", "weights", (1.0, 2.5, 1e-3)),
-    ("weights: []", "weights", ()),
-    ("cap: 500", "cap", 500),
-    ("cap: null", "cap", None),
-    ("out: runs/a", "out", Path("runs/a")),
-    ("stages: [{scale: 1, views: 2}, {scale: 0.5}]", "stages", (Stage(1.0, 2), Stage(0.5))),
-    ("extra: {opacity: 1}", "extra", Rates(opacity=1.0)),
-    ("table: {a: 1}", "table", {"a": 1.0}),
-])
+@pytest.mark.parametrize(
+    "text, name, value",
+    [
+        ("rates: {position: 1e-3}", "rates", Rates(1e-3)),
+        ("rates: {position: 1}", "rates", Rates(1.0)),
+        ("rates: {position: .inf}", "rates", Rates(math.inf)),
+        (f"rates: {{position: {'9' * 400}}}", "rates", Rates(math.inf)),
+        ("steps: 3e4", "steps", 30000),
+        ("name: off", "name", "off"),
+        ("name: 1:30", "name", "1:30"),
+        ("specular: off", "specular", "off"),
+        ("weights: [1, 2.5, 1e-3]", "weights", (1.0, 2.5, 1e-3)),
+        ("weights: []", "weights", ()),
+        ("cap: 500", "cap", 500),
+        ("cap: null", "cap", None),
+        ("out: runs/a", "out", Path("runs/a")),
+        ("stages: [{scale: 1, views: 2}, {scale: 0.5}]", "stages", (Stage(1.0, 2), Stage(0.5))),
+        ("extra: {opacity: 1}", "extra", Rates(opacity=1.0)),
+        ("table: {a: 1}", "table", {"a": 1.0}),
+    ],
+)
 def test_values(load, text, name, value):
     settings = load(text)
     assert getattr(settings, name) == value
     assert type(getattr(settings, name)) is type(value)
 
 
-@pytest.mark.parametrize("text, words", [
-    ("step: 3", ["unknown key 'step'", "did you mean 'steps'"]),
-    ("rates: {positon: 3}", ["'rates.positon'", "'rates.position'"]),
-    ("opacity: 3", ["'opacity'", "'rates.opacity'"]),
-    ("zzzzzzzzz: 3", ["'zzzzzzzzz'", "steps, name"]),
-    ("3: 3", ["'3'"]),
-    ("steps: many", ["'steps' must be an integer, got the string 'many'"]),
-    ("steps: 1.5", ["'steps'", "integer", "1.5"]),
-    ("steps: true", ["'steps'", "integer", "true"]),
-    ("steps:", ["'steps'", "got nothing"]),
-    ("steps: 0", ["'steps' is 0", "at least 1"]),
-    ("mask: 1", ["'mask'", "true or false"]),
-    ("mask: yes", ["'mask'", "true or false"]),
-    ("name: 3", ["'name'", "a string", "the number 3"]),
-    ("specular: split", ["'specular'", "'split_sum', 'monte_carlo'"]),
-    ("size: [1, 2, 3]", ["'size'", "list of 2"]),
-    ("size: [1, a]", ["'size[1]'", "integer"]),
-    ("size: 3", ["'size'", "list of 2"]),
-    ("weights: [1, -1]", ["'weights[1]'", "at least 0"]),
-    ("cap: a", ["'cap'", "an integer or null"]),
-    ("cap: 3", ["cap must not be below steps"]),
-    ("rates: 3", ["'rates'", "mapping"]),
-    ("rates: {opacity: 1.01}", ["'rates.opacity' is 1.01", "between 0 and 1"]),
-    ("rates: {position: .nan}", ["'rates.position' is NaN"]),
-    ("stages: [{views: 1}]", ["'scale'"]),
-    ("stages: [{scal: 1}]", ["'stages[0].scal'"]),
-    ("extra: {opacity: x}", ["'extra.opacity'", "a number"]),
-    ("- a", ["mapping"]),
-    ("hello", ["mapping"]),
-    ("steps: 3\n  mask: [", ["line 2", "malformed YAML"]),
-    ("steps: 3\nname: a\nsteps: 4", ["line 3", "'steps' appears twice"]),
-    ("steps: !!int ''", ["malformed"]),
-    ("steps: !!python/object:os.system {}", ["malformed"]),
-    ("? [a]\n: 3", ["malformed"]),
-    ("a: \0", ["malformed"]),
-])
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("step: 3", ["unknown key 'step'", "did you mean 'steps'"]),
+        ("rates: {positon: 3}", ["'rates.positon'", "'rates.position'"]),
+        ("opacity: 3", ["'opacity'", "'rates.opacity'"]),
+        ("zzzzzzzzz: 3", ["'zzzzzzzzz'", "steps, name"]),
+        ("3: 3", ["'3'"]),
+        ("steps: many", ["'steps' must be an integer, got the string 'many'"]),
+        ("steps: 1.5", ["'steps'", "integer", "1.5"]),
+        ("steps: true", ["'steps'", "integer", "true"]),
+        ("steps:", ["'steps'", "got nothing"]),
+        ("steps: 0", ["'steps' is 0", "at least 1"]),
+        ("mask: 1", ["'mask'", "true or false"]),
+        ("mask: yes", ["'mask'", "true or false"]),
+        ("name: 3", ["'name'", "a string", "the number 3"]),
+        ("specular: split", ["'specular'", "'split_sum', 'monte_carlo'"]),
+        ("size: [1, 2, 3]", ["'size'", "list of 2"]),
+        ("size: [1, a]", ["'size[1]'", "integer"]),
+        ("size: 3", ["'size'", "list of 2"]),
+        ("weights: [1, -1]", ["'weights[1]'", "at least 0"]),
+        ("cap: a", ["'cap'", "an integer or null"]),
+        ("cap: 3", ["cap must not be below steps"]),
+        ("rates: 3", ["'rates'", "mapping"]),
+        ("rates: {opacity: 1.01}", ["'rates.opacity' is 1.01", "between 0 and 1"]),
+        ("rates: {position: .nan}", ["'rates.position' is NaN"]),
+        ("stages: [{views: 1}]", ["'scale'"]),
+        ("stages: [{scal: 1}]", ["'stages[0].scal'"]),
+        ("extra: {opacity: x}", ["'extra.opacity'", "a number"]),
+        ("- a", ["mapping"]),
+        ("hello", ["mapping"]),
+        ("steps: 3\n  mask: [", ["line 2", "malformed YAML"]),
+        ("steps: 3\nname: a\nsteps: 4", ["line 3", "'steps' appears twice"]),
+        ("steps: !!int ''", ["malformed"]),
+        ("steps: !!python/object:os.system {}", ["malformed"]),
+        ("? [a]\n: 3", ["malformed"]),
+        ("a: \0", ["malformed"]),
+    ],
+)
 def test_mistakes(load, tmp_path, text, words):
     with pytest.raises(UserError) as info:
         load(text)
@@ -140,14 +150,17 @@ def test_mistakes(load, tmp_path, text, words):
     assert all(word in message for word in words), message
 
 
-@pytest.mark.parametrize("override, words", [
-    ("steps", ["--set steps:", "a.b=1"]),
-    ("=3", ["a.b=1"]),
-    ("rates.opacty=1", ["--set rates.opacty=1", "'rates.opacity'"]),
-    ("steps.a=1", ["'steps'", "an integer"]),
-    ("size=[1", ["--set size=[1", "malformed"]),
-    ("steps=nan", ["'steps'"]),
-])
+@pytest.mark.parametrize(
+    "override, words",
+    [
+        ("steps", ["--set steps:", "a.b=1"]),
+        ("=3", ["a.b=1"]),
+        ("rates.opacty=1", ["--set rates.opacty=1", "'rates.opacity'"]),
+        ("steps.a=1", ["'steps'", "an integer"]),
+        ("size=[1", ["--set size=[1", "malformed"]),
+        ("steps=nan", ["'steps'"]),
+    ],
+)
 def test_override_mistakes(override, words):
     with pytest.raises(UserError) as info:
         load_config(Settings, overrides=[override])

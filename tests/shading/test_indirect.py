@@ -79,12 +79,19 @@ def test_what_rays_meet_reflects_by_normals_that_turn():
     def error(curvature):
         base = tangent_surfels(400, curvature).numpy()
         full = lambda name, value: {name: np.full_like(base[name], value)}
-        surfels = Surfels.from_numpy(base | full("roughness", 0.1) | full("metallic", 1) | full("base_color", 1)
-                                     | {"sh": np.full((400, 3), -0.5 / SH_0)}, two_sided=False)
+        surfels = Surfels.from_numpy(
+            base
+            | full("roughness", 0.1)
+            | full("metallic", 1)
+            | full("base_color", 1)
+            | {"sh": np.full((400, 3), -0.5 / SH_0)},
+            two_sided=False,
+        )
         indirect = Indirect("one_bounce", Proxies(surfels), surfels)
         none = dr.zeros(mi.Color3f, dr.width(direction))
-        mine = indirect.cover(none, mi.Point3f(normal - direction), mi.Vector3f(0), direction,
-                              deferred.Lighting(estimator, indirect=indirect)).numpy()
+        mine = indirect.cover(
+            none, mi.Point3f(normal - direction), mi.Vector3f(0), direction, deferred.Lighting(estimator, indirect=indirect)
+        ).numpy()
         met = mine.max(0) > 0
         assert met.mean() > 0.9
         return abs(mine - expected)[:, met].mean()
@@ -104,13 +111,20 @@ def corner():
     floor, wall = plate([-1, -1, 0], [2, 0, 0], [0, 2, 0]), plate([-1, 1, 0], [2, 0, 0], [0, 0, 1.5])
     n, is_wall = len(floor), np.repeat([False, True], len(floor))
     pick = lambda of_floor, of_wall: np.where(is_wall[:, None], of_wall, of_floor).astype(np.float32)
-    return Surfels.from_numpy({
-        "centers": np.concatenate([floor, wall]),
-        "rotations": np.concatenate([rotation_from_normal(np.tile(d, (n, 1))) for d in ([0.0, 0, 1], [0.0, -1, 0])]),
-        "scales": np.full((2 * n, 2), 2 / 60), "opacities": np.full((2 * n, 1), 0.99),
-        "sh": (pick(np.zeros(3), WALL) - 0.5) / SH_0,
-        "base_color": pick(np.ones(3), np.zeros(3)), "roughness": pick([0], [1]), "metallic": pick([1], [1]),
-        "delta_normal": np.zeros((2 * n, 3))}, two_sided=False)
+    return Surfels.from_numpy(
+        {
+            "centers": np.concatenate([floor, wall]),
+            "rotations": np.concatenate([rotation_from_normal(np.tile(d, (n, 1))) for d in ([0.0, 0, 1], [0.0, -1, 0])]),
+            "scales": np.full((2 * n, 2), 2 / 60),
+            "opacities": np.full((2 * n, 1), 0.99),
+            "sh": (pick(np.zeros(3), WALL) - 0.5) / SH_0,
+            "base_color": pick(np.ones(3), np.zeros(3)),
+            "roughness": pick([0], [1]),
+            "metallic": pick([1], [1]),
+            "delta_normal": np.zeros((2 * n, 3)),
+        },
+        two_sided=False,
+    )
 
 
 def image(surfels, kind, environment=None):
@@ -129,14 +143,24 @@ def array(color):
 def truth():
     """The same corner from Mitsuba's path tracer: a mirror and an area light."""
     square = lambda matrix: mi.ScalarTransform4f(np.array(matrix, float))
-    return mi.render(mi.load_dict({
-        "type": "scene", "integrator": {"type": "path", "max_depth": 3, "hide_emitters": True},
-        "sensor": CAMERA.to_sensor_dict() | {"sampler": {"type": "independent"}},
-        "floor": {"type": "rectangle", "bsdf": {"type": "conductor", "material": "none"}},
-        "wall": {"type": "rectangle", "bsdf": {"type": "diffuse", "reflectance": 0.0},
-                 "to_world": square([[1, 0, 0, 0], [0, 0, -1, 1], [0, 0.75, 0, 0.75], [0, 0, 0, 1]]),
-                 "emitter": {"type": "area", "radiance": {"type": "rgb", "value": WALL.tolist()}}},
-        "light": {"type": "constant", "radiance": LIGHT}}), spp=64).numpy()[..., :3]
+    return mi.render(
+        mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": "path", "max_depth": 3, "hide_emitters": True},
+                "sensor": CAMERA.to_sensor_dict() | {"sampler": {"type": "independent"}},
+                "floor": {"type": "rectangle", "bsdf": {"type": "conductor", "material": "none"}},
+                "wall": {
+                    "type": "rectangle",
+                    "bsdf": {"type": "diffuse", "reflectance": 0.0},
+                    "to_world": square([[1, 0, 0, 0], [0, 0, -1, 1], [0, 0.75, 0, 0.75], [0, 0, 0, 1]]),
+                    "emitter": {"type": "area", "radiance": {"type": "rgb", "value": WALL.tolist()}},
+                },
+                "light": {"type": "constant", "radiance": LIGHT},
+            }
+        ),
+        spp=64,
+    ).numpy()[..., :3]
 
 
 def floor_reflecting(expected, radiance):
@@ -168,8 +192,10 @@ def test_kinds():
 @pytest.mark.parametrize("roughness, part", [(0.2, 1), (0.25, 0.75), (0.35, 0.25), (0.4, 0)])
 def test_what_is_rough_reflects_no_surfels_with_a_radiance_of_their_own(roughness, part, sampled):
     base = corner().numpy()
-    surfels = Surfels.from_numpy(base | {"roughness": np.where(base["roughness"] < 0.5, roughness, base["roughness"]).astype(
-        np.float32)}, two_sided=False)
+    surfels = Surfels.from_numpy(
+        base | {"roughness": np.where(base["roughness"] < 0.5, roughness, base["roughness"]).astype(np.float32)},
+        two_sided=False,
+    )
     shade = lambda *how: array(deferred.render(surfels, CAMERA, lighting(surfels, *how)).specular)
     free, wholly, mine = shade(None, sampled), shade("visibility", sampled, True), shade("visibility", sampled)
     hidden, where = free - wholly, floor_reflecting(truth(), WALL)
@@ -183,9 +209,12 @@ def test_gradients_equal_finite_differences():
     surfels = corner()
     base = surfels.numpy()
     shape = base["roughness"].shape
-    base |= {"roughness": np.full(shape, 0.28, np.float32), "metallic": np.full(shape, 0.6, np.float32),
-             "sh": base["sh"] + np.float32(0.5),  # a radiance of zero is a kink
-             "base_color": rng.uniform(0.3, 0.8, base["base_color"].shape).astype(np.float32)}
+    base |= {
+        "roughness": np.full(shape, 0.28, np.float32),
+        "metallic": np.full(shape, 0.6, np.float32),
+        "sh": base["sh"] + np.float32(0.5),  # a radiance of zero is a kink
+        "base_color": rng.uniform(0.3, 0.8, base["base_color"].shape).astype(np.float32),
+    }
     base["texels"] = rng.uniform(0.3, 0.9, (16, 32, 3)).astype(np.float32)
     weights = rng.normal(size=(3, SIZE[0] * SIZE[1])).astype(np.float32)
 
@@ -212,8 +241,11 @@ def test_gradients_equal_finite_differences():
 def lighting(surfels, kind, sampled=False, lit=False):
     """The `Lighting` of ``surfels`` by a constant light; ``kind``: of `Indirect`, None: without."""
     environment = Environment(mi.TensorXf(np.full((16, 32, 3), LIGHT, np.float32)), np.eye(3))
-    estimator = SplitSum(environment.filtered()) if not sampled else MonteCarlo(
-        environment.unfiltered(), environment.emitter(), DEFAULT_ETA, 256, mi.UInt32(0))
+    estimator = (
+        SplitSum(environment.filtered())
+        if not sampled
+        else MonteCarlo(environment.unfiltered(), environment.emitter(), DEFAULT_ETA, 256, mi.UInt32(0))
+    )
     return deferred.Lighting(estimator, indirect=kind and Indirect(kind, Proxies(surfels), surfels), lit=lit)
 
 
@@ -226,10 +258,20 @@ def disc_over_a_patch(height=0.5, radius=0.4):
     normals = np.tile([0.0, 0.0, -1.0], (n, 1))
     normals[0] = 0, 0, 1
     full = lambda value, channels: np.full((n, channels), value, np.float32)
-    return Surfels.from_numpy({
-        "centers": centers, "rotations": rotation_from_normal(normals), "scales": full(0.01, 2), "opacities": full(0.99, 1),
-        "sh": full(0, 3), "base_color": full(0.5, 3), "roughness": full(0.5, 1), "metallic": full(0, 1),
-        "delta_normal": full(0, 3)}, two_sided=False)
+    return Surfels.from_numpy(
+        {
+            "centers": centers,
+            "rotations": rotation_from_normal(normals),
+            "scales": full(0.01, 2),
+            "opacities": full(0.99, 1),
+            "sh": full(0, 3),
+            "base_color": full(0.5, 3),
+            "roughness": full(0.5, 1),
+            "metallic": full(0, 1),
+            "delta_normal": full(0, 3),
+        },
+        two_sided=False,
+    )
 
 
 @pytest.mark.parametrize("two_sided", [True, False])
@@ -247,8 +289,15 @@ def test_share_of_diffuse_light_under_a_disc(two_sided):
 def test_diffuse_light_of_split_sum_is_that_of_monte_carlo(kind):
     """On the floor before the wall, both matte and lit: without shares half of the light would be too much in the edge."""
     base = corner().numpy()
-    surfels = Surfels.from_numpy(base | {"metallic": np.zeros_like(base["metallic"]), "roughness": np.ones_like(
-        base["roughness"]), "base_color": np.full_like(base["base_color"], 0.2)}, two_sided=False)
+    surfels = Surfels.from_numpy(
+        base
+        | {
+            "metallic": np.zeros_like(base["metallic"]),
+            "roughness": np.ones_like(base["roughness"]),
+            "base_color": np.full_like(base["base_color"], 0.2),
+        },
+        two_sided=False,
+    )
     lightings = [lighting(surfels, *how, lit=True) for how in ((kind, True), (None,), (kind,))]
     lightings[2] = lightings[2].with_share()
     expected, free, shared = (array(deferred.render(surfels, CAMERA, l).diffuse)[..., 0] for l in lightings)

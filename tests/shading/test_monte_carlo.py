@@ -11,9 +11,12 @@ from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.monte_carlo import MonteCarlo
 
 ROUGHNESS = np.float32([0.04, 0.2, 0.4, 0.8])
-BASE = {"roughness": ROUGHNESS, "metallic": np.float32([1, 0.5, 0.3, 0.8]),
-        "base_color": np.random.default_rng(1).uniform(0.2, 0.9, (3, 4)).astype(np.float32),
-        "normal": np.float32([[0, 0.3, -0.2, 0.1], [0.1, 0.2, 0.5, -0.4], [1, 1, 1, 1]])}
+BASE = {
+    "roughness": ROUGHNESS,
+    "metallic": np.float32([1, 0.5, 0.3, 0.8]),
+    "base_color": np.random.default_rng(1).uniform(0.2, 0.9, (3, 4)).astype(np.float32),
+    "normal": np.float32([[0, 0.3, -0.2, 0.1], [0.1, 0.2, 0.5, -0.4], [1, 1, 1, 1]]),
+}
 
 
 def texels(rows=64):
@@ -59,8 +62,9 @@ def gradients(request):
     return request.param, found
 
 
-@pytest.mark.parametrize("name, step", [("roughness", 4e-3), ("metallic", 0.05), ("base_color", 0.05), ("normal", 2e-3),
-                                        ("texels", 0.05)])
+@pytest.mark.parametrize(
+    "name, step", [("roughness", 4e-3), ("metallic", 0.05), ("base_color", 0.05), ("normal", 2e-3), ("texels", 0.05)]
+)
 def test_derivatives_equal_finite_differences(gradients, name, step):
     """By their standard errors, and within 2 % of the largest; the differences are of many samples with equal numbers."""
     lobe, found = gradients
@@ -139,8 +143,9 @@ def test_paired_estimates_free_the_squared_error_of_noise_bias():
         dr.enable_grad(leaf)
         normal, view, _, metallic, color = (dr.detach(v) for v in arguments)
         spread = lambda v: dr.gather(type(v), v, lane)
-        C = estimator(environment, samples, 1, paired=paired).specular(spread(normal), spread(view), leaf, spread(metallic),
-                                                                       spread(color))
+        C = estimator(environment, samples, 1, paired=paired).specular(
+            spread(normal), spread(view), leaf, spread(metallic), spread(color)
+        )
         dr.backward(dr.sum(dr.sum(dr.square(C - spread(target)))))
         return dr.grad(leaf).numpy().reshape(copies, n).astype(np.float64)
 
@@ -160,8 +165,13 @@ def test_split_sum_diffuse_equals_monte_carlo():
 def test_other_scenes_render_after_it():
     """The materials of many lanes that it leaves in Mitsuba's registry must not disturb whoever else calls BSDFs."""
     reflected(estimator(texels(), 16), "specular")
-    scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "light": {"type": "constant"},
-                          "sphere": {"type": "sphere", "bsdf": {"type": "principled"}},
-                          "sensor": {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([3, 0, 0], [0, 0, 0],
-                                                                                                       [0, 0, 1])}})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path"},
+            "light": {"type": "constant"},
+            "sphere": {"type": "sphere", "bsdf": {"type": "principled"}},
+            "sensor": {"type": "perspective", "to_world": mi.ScalarTransform4f().look_at([3, 0, 0], [0, 0, 0], [0, 0, 1])},
+        }
+    )
     assert np.isfinite(mi.render(scene, spp=1).numpy()).all()

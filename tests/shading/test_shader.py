@@ -45,7 +45,7 @@ def reference(weights, values):
     for i, (*C_s, roughness, cosine) in enumerate(values.astype(np.float64).T):
         x, first = np.array([*np.log1p(C_s), roughness, cosine, 1.0]), 0
         for k, (rows, columns) in enumerate(SHAPES):
-            x = weights[first:first + rows * columns].reshape(rows, columns) @ x
+            x = weights[first : first + rows * columns].reshape(rows, columns) @ x
             x = np.where(x > 0, x, 0.01 * x) if k + 1 < len(SHAPES) else np.tanh(x)
             first += rows * columns
         out[:, i] = C_s * np.exp(np.log(4) * x)
@@ -119,6 +119,7 @@ def test_no_kernel_is_compiled_for_another_number_of_pixels():
 
 # ---- In a fit ----
 
+
 def mlp_model():
     plain = model()
     parameters = {name: plain.numpy(name) for name in plain.optimizer.keys()}
@@ -157,6 +158,7 @@ def test_a_shader_learns_what_the_identity_cannot(dataset):
 
 # ---- In files ----
 
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """(the folder of a run with a shader, the scene and the photographs that it fitted)."""
@@ -174,8 +176,9 @@ def test_exported_scene_renders_the_same(run, tmp_path):
     assert_renders_as_written(scene, folder)
     weights = scene.integrator().shader.weights.numpy()
     assert np.abs(weights - initial_weights(0)).max() > 0.02
-    with_maps, without = (render_scene(folder, out=tmp_path / f"{aovs}.png", aovs=aovs)[0].read_bytes()
-                          for aovs in (True, False))
+    with_maps, without = (
+        render_scene(folder, out=tmp_path / f"{aovs}.png", aovs=aovs)[0].read_bytes() for aovs in (True, False)
+    )
     assert with_maps == without
     plain = (folder / "scene.xml").read_text().replace('<string name="shader" value="shader.npz" />', "")
     (folder / "plain.xml").write_text(plain)
@@ -202,18 +205,26 @@ def test_round_trip(tmp_path):
     assert np.array_equal(Shader.load(tmp_path / "shader.npz").weights.numpy(), weights)
 
 
-@pytest.mark.parametrize("content, message", [
-    (None, "can't be read .*: check the path"), (b"", "is no shader"), (b"words", "is no shader"),
-    (npz()[:-30], "is no shader"), (npz(weights_1=np.array([{}])), "is no shader"),
-    (npz(weights_1=np.zeros((12, 7))), r"'weights_1' is float64 of shape \(12, 7\), needs floats of shape \(12, 12\)"),
-    (npz(weights_2=np.full((3, 12), "a")), "'weights_2' is <U1"),
-    (npz(weights_0=np.full((12, 6), np.nan)), "'weights_0' is not finite"),
-])
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        (None, "can't be read .*: check the path"),
+        (b"", "is no shader"),
+        (b"words", "is no shader"),
+        (npz()[:-30], "is no shader"),
+        (npz(weights_1=np.array([{}])), "is no shader"),
+        (npz(weights_1=np.zeros((12, 7))), r"'weights_1' is float64 of shape \(12, 7\), needs floats of shape \(12, 12\)"),
+        (npz(weights_2=np.full((3, 12), "a")), "'weights_2' is <U1"),
+        (npz(weights_0=np.full((12, 6), np.nan)), "'weights_0' is not finite"),
+    ],
+)
 def test_malformed_files(tmp_path, content, message):
     if content is not None:
         (tmp_path / "shader.npz").write_bytes(content)
-    (tmp_path / "scene.xml").write_text('<scene version="3.0.0"> <integrator type="rgs_deferred"> '
-                                        '<string name="shader" value="shader.npz"/> </integrator> </scene>')
+    (tmp_path / "scene.xml").write_text(
+        '<scene version="3.0.0"> <integrator type="rgs_deferred"> '
+        '<string name="shader" value="shader.npz"/> </integrator> </scene>'
+    )
     with pytest.raises(UserError, match=f"shader.npz: {message}") as error:
         load_scene(tmp_path / "scene.xml", {})
     assert "\n" not in str(error.value) and str(tmp_path) in str(error.value)

@@ -30,8 +30,9 @@ def test_albedo_equals_bsdf_sampling(roughness, cosine, metallic, base_color):
     bsdf = tables.principled(roughness, metallic, base_color, 1.5)
     wi = mi.Vector3f(float(np.sqrt(1 - cosine**2)), 0, cosine) + dr.zeros(mi.Vector3f, n)
     rng = mi.PCG32(size=n)
-    sample, weight = bsdf.sample(mi.BSDFContext(), tables.interaction(wi), rng.next_float32(),
-                                 mi.Point2f(rng.next_float32(), rng.next_float32()))
+    sample, weight = bsdf.sample(
+        mi.BSDFContext(), tables.interaction(wi), rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
+    )
     weight = dr.select(sample.pdf > 0, weight.x, 0).numpy()
     one = lambda v: mi.Float(v)
     mine = split_sum.albedo(one(cosine), one(roughness), one(metallic), mi.Color3f(base_color), 1.5)[0].x[0]
@@ -83,8 +84,14 @@ def test_environment_equals_the_envmap_emitter():
     right, and the texels of a pole's row differ.)"""
     rng = np.random.default_rng(1)
     texels = rng.uniform(0, 1, (16, 32, 3)).astype(np.float32)
-    emitter = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(texels), "scale": 1.5,
-                            "to_world": mi.ScalarTransform4f().rotate([0.6, 0.8, 0], 90).rotate([0, 1, 0], 40)})
+    emitter = mi.load_dict(
+        {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(texels),
+            "scale": 1.5,
+            "to_world": mi.ScalarTransform4f().rotate([0.6, 0.8, 0], 90).rotate([0, 1, 0], 40),
+        }
+    )
     environment = Environment.from_emitter(emitter)
     d = vector(np.concatenate([unit(rng, 4000), environment.rotation.T[[0, 2]], -environment.rotation.T[[0, 2]]]))
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(d))
@@ -114,8 +121,10 @@ def test_gradients_equal_finite_differences(entry):
     surfels = layered_surfels(camera, seed=0)
     theta, phi = np.meshgrid(np.linspace(0, np.pi, 128), np.arange(256) / 256 * 2 * np.pi, indexing="ij")
     smooth = 0.6 + 0.3 * np.sin(theta) * np.sin(phi) + 0.1 * np.cos(2 * theta)  # bilinear lookups have kinks at texels
-    base = surfels.numpy() | {"roughness": np.full((len(surfels), 1), (entry + 0.5) / (tables.ROUGHNESSES - 1), np.float32),
-                              "texels": np.stack([smooth, smooth**2, 1 / smooth], -1).astype(np.float32)}
+    base = surfels.numpy() | {
+        "roughness": np.full((len(surfels), 1), (entry + 0.5) / (tables.ROUGHNESSES - 1), np.float32),
+        "texels": np.stack([smooth, smooth**2, 1 / smooth], -1).astype(np.float32),
+    }
     weights = rng.uniform(0.5, 1.5, (3, 400)).astype(np.float32)  # of one sign, or what they add would cancel
 
     def render(arrays):

@@ -30,8 +30,13 @@ def stacked(maps):
 
 def inner(maps, weights):
     """<weights, maps> as a Dr.Jit scalar."""
-    columns = [c for name in MAPS for c in (getattr(maps, name) if name in
-               ("diffuse", "normal", "base_color", "delta_normal") else [getattr(maps, name)])]
+    columns = [
+        c
+        for name in MAPS
+        for c in (
+            getattr(maps, name) if name in ("diffuse", "normal", "base_color", "delta_normal") else [getattr(maps, name)]
+        )
+    ]
     return sum(dr.sum(c * mi.Float(w)) for c, w in zip(columns, weights))
 
 
@@ -45,10 +50,17 @@ def gradients(render, surfels, camera, weights):
     return result
 
 
-@pytest.mark.parametrize("camera", [
-    orbit_camera(), orbit_camera(2.0, (37, 53)), orbit_camera(1.0, (64, 64), distance=1.6),
-    replace(orbit_camera(0.7), principal=(11.0, 31.0)), replace(orbit_camera(0.2), focal=(90.0, 50.0)),
-], ids=["plain", "odd size", "inside reach", "principal point", "anisotropic pixels"])
+@pytest.mark.parametrize(
+    "camera",
+    [
+        orbit_camera(),
+        orbit_camera(2.0, (37, 53)),
+        orbit_camera(1.0, (64, 64), distance=1.6),
+        replace(orbit_camera(0.7), principal=(11.0, 31.0)),
+        replace(orbit_camera(0.2), focal=(90.0, 50.0)),
+    ],
+    ids=["plain", "odd size", "inside reach", "principal point", "anisotropic pixels"],
+)
 @pytest.mark.parametrize("count", [40, 300])
 def test_forward_equals_reference(camera, count):
     surfels = sphere_surfels(count, seed=count)
@@ -77,7 +89,7 @@ def test_window_brings_tiles_into_order():
 
     def image(shift, window):
         maps = render_gbuffer(surfels, camera.cropped(-shift, -shift, 104, 104), Cutoffs(window=window))
-        return stacked(maps).reshape(17, 104, 104)[:, shift:shift + 96, shift:shift + 96]
+        return stacked(maps).reshape(17, 104, 104)[:, shift : shift + 96, shift : shift + 96]
 
     seams = {window: np.square(image(0, window) - image(4, window)).mean() for window in (1, 16)}
     assert 0 < seams[16] < 0.1 * seams[1], seams
@@ -89,7 +101,7 @@ def test_curved_surfels_have_the_normals_of_a_sphere():
     directions = camera.rays().reshape(-1, 3)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     closest = -directions @ camera.origin
-    inside = 1 - ((camera.origin + closest[:, None] * directions)**2).sum(1)
+    inside = 1 - ((camera.origin + closest[:, None] * directions) ** 2).sum(1)
     seen = inside > 0.2  # away from the silhouette
     true = camera.origin + (closest - np.sqrt(np.maximum(inside, 0)))[:, None] * directions
 

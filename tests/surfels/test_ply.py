@@ -95,6 +95,7 @@ def test_other_encodings(ply, tmp_path, form):
 
 def test_plain_2dgs(ply, tmp_path):
     """No material, two scales, quaternions that are not normalised, a saturated opacity."""
+
     def change(data):
         data["opacity"][0], data["opacity"][1] = 1000, -1000
         for i in range(4):
@@ -164,9 +165,14 @@ def test_not_surfels(tmp_path):
     path = tmp_path / "a.ply"
     refused(path)
     refused(tmp_path)
-    for content in (b"", b"ply", b"hello\n", b"ply\nformat ascii 1.0\nend_header\n",
-                    b"ply\nformat ascii 1.0\nelement vertex 3\nend_header\n1\n2\n3\n",
-                    b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list int int x\nend_header\n1 1\n"):
+    for content in (
+        b"",
+        b"ply",
+        b"hello\n",
+        b"ply\nformat ascii 1.0\nend_header\n",
+        b"ply\nformat ascii 1.0\nelement vertex 3\nend_header\n1\n2\n3\n",
+        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list int int x\nend_header\n1 1\n",
+    ):
         path.write_bytes(content)
         refused(path)
 

@@ -174,8 +174,14 @@ def test_environment_is_z_up():
 
     from rgs_mi.targets.environments import studio
 
-    light = mi.load_dict({"type": "procedural_envmap", "name": "studio", "resolution": 256,
-                          "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90)})
+    light = mi.load_dict(
+        {
+            "type": "procedural_envmap",
+            "name": "studio",
+            "resolution": 256,
+            "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90),
+        }
+    )
     rng = np.random.default_rng(0)
     d = rng.normal(size=(2000, 3))
     d /= np.linalg.norm(d, axis=1, keepdims=True)
@@ -183,7 +189,7 @@ def test_environment_is_z_up():
     si.wi = mi.Vector3f(-d.T.astype(np.float32))
     seen, painted = np.array(light.eval(si)).T, studio(d)
     close = np.abs(seen - painted).max(1) < 0.1 + 0.1 * painted.max(1)
-    assert close.mean() > 0.7       # the rest lies on edges finer than a texel
+    assert close.mean() > 0.7  # the rest lies on edges finer than a texel
 
 
 @pytest.mark.parametrize("model, part, known", [("boat", "hull", "helmet"), ("helmet", "antenna", "visor")])

@@ -19,8 +19,10 @@ METAL = Case("sphere", "kitchen", 0.3, 1.0, (0.9, 0.6, 0.2))
 PLASTIC = Case("sphere", "kitchen", 0.2, 0.0, (0.1, 0.3, 0.7))
 
 
-@pytest.mark.parametrize("case", [METAL, PLASTIC, Case("sphere", "kitchen", 0.02, 0.0, (0, 0, 0)),
-                                  Case("toaster", "kitchen", 0.3, 1.0, (0.9, 0.6, 0.2))])
+@pytest.mark.parametrize(
+    "case",
+    [METAL, PLASTIC, Case("sphere", "kitchen", 0.02, 0.0, (0, 0, 0)), Case("toaster", "kitchen", 0.3, 1.0, (0.9, 0.6, 0.2))],
+)
 def test_monte_carlo_equals_path(case):
     """Specular and diffuse; the toaster, whose slots are dark, with the rays of its own scene."""
     result = Validator(16, 64).run(case)
@@ -64,8 +66,11 @@ def test_checks_pass():
 def test_grid():
     whole = grid(("sphere", "helmet"), ("studio",), (0.1, 0.5))
     assert len(whole) == len({c.name for c in whole}) == 2 * 2 * (len(cases.METALS) + len(cases.DIELECTRICS))
-    for arguments, words in [((["spher"],), "unknown model 'spher'"), ((["sphere"], ["moon"]), "unknown environment 'moon'"),
-                             ((["sphere"], ["studio"], [1.5]), "roughness is 1.5")]:
+    for arguments, words in [
+        ((["spher"],), "unknown model 'spher'"),
+        ((["sphere"], ["moon"]), "unknown environment 'moon'"),
+        ((["sphere"], ["studio"], [1.5]), "roughness is 1.5"),
+    ]:
         with pytest.raises(UserError, match=words):
             grid(*arguments)
     with pytest.raises(UserError, match="too few"):
@@ -74,8 +79,21 @@ def test_grid():
 
 def test_script(tmp_path):
     """A page, a table and maps; 1 where a bound is broken, as by so few samples it may be."""
-    command = [sys.executable, ROOT / "scripts" / "crossvalidate.py", "--environments", "kitchen", "--roughness", "0.02",
-               "--size", "12", "--samples", "4", "--out", tmp_path / "out", "--quiet"]
+    command = [
+        sys.executable,
+        ROOT / "scripts" / "crossvalidate.py",
+        "--environments",
+        "kitchen",
+        "--roughness",
+        "0.02",
+        "--size",
+        "12",
+        "--samples",
+        "4",
+        "--out",
+        tmp_path / "out",
+        "--quiet",
+    ]
     run = subprocess.run(command, capture_output=True, text=True)
     assert run.returncode in (0, 1) and "Traceback" not in run.stderr
     assert (run.returncode == 1) == bool(run.stderr.strip()), run.stderr
