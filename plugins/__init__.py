@@ -8,7 +8,7 @@ import mitsuba as mi
 
 from rgs_mi.core.errors import UserError
 
-_MODULES = ("procedural", "lanes", "surfels", "rgs_deferred", "rgs_path")
+_MODULES = ("procedural", "wavefront", "surfels", "rgs_deferred", "rgs_path")
 
 
 def _load(_old, new):

@@ -11,8 +11,8 @@ Procedural targets (:monosp:`procedural_mesh`, :monosp:`procedural_envmap`)
 ``<emitter type="procedural_envmap">``: an environment of `rgs_mi.targets.environments`, as a stock ``envmap``.
 
  * - name:       |string| e.g. ``studio``, or ``constant``, a uniform map to start a fit from
- * - resolution: |int| height in texels; the width is twice that (Default: 512; not of ``constant``)
- * - radiance, rows: |float|, |int| radiance and height in texels of ``constant`` (Default: 0.5 and 128)
+ * - height:     |int| height in texels; the width is twice that (Default: 512, of ``constant`` 128)
+ * - radiance:   |float| of ``constant`` (Default: 0.5)
  * - scale:      |float| factor on the radiance (Default: 1)
  * - to_world:   |transform| as of ``envmap``, whose up is y: rotate by 90 degrees around x in a z-up world
 
@@ -46,9 +46,9 @@ def procedural_mesh(props):
 def procedural_envmap(props):
     """The factory of ``<emitter type="procedural_envmap">``."""
     if props["name"] == "constant":
-        pixels = environments.constant(float(props.get("radiance", 0.5)), int(props.get("rows", 128)))
+        pixels = environments.constant(float(props.get("radiance", 0.5)), int(props.get("height", 128)))
     else:
-        pixels = environments.environment(str(props["name"]), int(props.get("resolution", 512)))
+        pixels = environments.environment(str(props["name"]), int(props.get("height", 512)))
     return mi.load_dict(
         {
             "type": "envmap",

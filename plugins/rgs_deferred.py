@@ -44,14 +44,17 @@ what a principled BSDF with the G-buffer's material reflects of the environment 
 
  * - aovs
    - |string|
-   - Further channels, a comma-separated list out of those below (Default: none)
+   - Further channels, a comma-separated list of ``<name>:<type>`` pairs as Mitsuba's :monosp:`aov` has them, for example
+     ``nn:sh_normal``; a type alone is named after itself (Default: none)
 
-Channels of ``aovs`` follow Mitsuba's `aov` integrator. As all that a film holds they are premultiplied by the surfels'
-coverage: divide by ``alpha.Y`` for means.
+Types of ``aovs``, and the channels of one called ``name``. As all that a film holds they are premultiplied by the surfels'
+coverage: divide by that of type ``alpha`` for means.
 
- * ``depth.T``: distance along the ray                ``normal.X .Y .Z``: shading normal, world space, not normalised
- * ``albedo.R .G .B``: the base colour                ``roughness.Y``, ``metallic.Y``
- * ``diffuse.R .G .B``, ``specular.R .G .B``: the two parts of the radiance       ``alpha.Y``: coverage
+ * ``depth``: distance along the ray, ``name.T``
+ * ``sh_normal``: shading normal, world space, not normalised, ``name.X``, ``name.Y``, ``name.Z``
+ * ``albedo``: the base colour, ``name.R``, ``name.G``, ``name.B``
+ * ``roughness``, ``metallic``, ``alpha`` (coverage): ``name.Y``
+ * ``diffuse``, ``specular``: the two parts of the radiance, ``name.R``, ``name.G``, ``name.B``
 
 The scene needs an ``envmap`` or ``constant`` emitter and a ``perspective`` sensor; other shapes and emitters are
 ignored. ``mi.render`` differentiates, in both modes, with respect to all fields of the surfels and the radiance of the
@@ -77,7 +80,7 @@ from rgs_mi.surfels.proxies import Proxies
 
 AOVS = {
     "depth": "T",
-    "normal": "XYZ",
+    "sh_normal": "XYZ",
     "albedo": "RGB",
     "roughness": "Y",
     "metallic": "Y",
@@ -105,13 +108,11 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         self.box = box_of(props)
         self.shader_file = resolve(props.get("shader", ""))
         self.shader = Shader.load(self.shader_file) if self.shader_file else None
-        self.aovs = [name.strip() for name in props.get("aovs", "").split(",") if name.strip()]
-        if unknown := [name for name in self.aovs if name not in AOVS]:
-            raise UserError(f"rgs_deferred: unknown aov '{unknown[0]}': choose from {', '.join(AOVS)}")
+        self.aovs = _aovs(props.get("aovs", ""))
         self.filtered = None
 
     def aov_names(self):
-        return [f"{name}.{channel}" for name in self.aovs for channel in AOVS[name]]
+        return [f"{name}.{channel}" for name, kind in self.aovs.items() for channel in AOVS[kind]]
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
@@ -157,8 +158,8 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         if not self.hide_emitters and environment is not None:
             color, alpha = color + (1 - alpha) * environment.eval(rays), mi.Float(1)
         values = [*color, *([alpha] if has_alpha else []), mi.Float(1)]
-        for name in self.aovs:
-            values += _aov(name, image, maps, camera, rays)
+        for kind in self.aovs.values():
+            values += _aov(kind, image, maps, camera, rays)
         return _average(values, width, height, samples)
 
     def lighting(self, scene, surfels, eta, environment, seed):
@@ -174,7 +175,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
             estimator = MonteCarlo(environment, scene.environment(), eta, self.samples, dr.opaque(mi.UInt32, seed))
         lit = self.diffuse == "lit"
         lighting = deferred.Lighting(estimator, self.shader, each_other, lit, self.box)
-        return lighting.with_share() if lit and each_other and self.specular == "split_sum" else lighting
+        return lighting.with_irradiance_visibility() if lit and each_other and self.specular == "split_sum" else lighting
 
     def environment(self, scene):
         """The scene's environment, filtered as the estimator needs it; kept until texels change."""
@@ -200,20 +201,34 @@ def _choice(props, name, default, choices):
     return value
 
 
-def _aov(name, image, maps, camera, rays):
+def _aovs(text) -> dict[str, str]:
+    """{name: type} of the property ``aovs``. Raises: UserError for an unknown type and for a name that is there twice."""
+    pairs = [entry.strip().rpartition(":") for entry in text.split(",") if entry.strip()]
+    aovs = {}
+    for name, _, kind in pairs:
+        name = name or kind
+        if kind not in AOVS:
+            raise UserError(f"rgs_deferred: unknown aov '{kind}': choose from {', '.join(AOVS)}")
+        if name in aovs:
+            raise UserError(f"rgs_deferred: two aovs are called '{name}': name one of them, as in 'other:{kind}'")
+        aovs[name] = kind
+    return aovs
+
+
+def _aov(kind, image, maps, camera, rays):
     """Channels of one AOV, premultiplied, a list of ``mi.Float`` with one lane a sample."""
-    if name == "depth":
+    if kind == "depth":
         forward = mi.Vector3f(*[dr.opaque(mi.Float, float(v)) for v in camera.rotation[2]])
         return [maps.depth / dr.dot(rays, forward)]
     value = {
-        "normal": maps.normal,
+        "sh_normal": maps.normal,
         "albedo": maps.base_color,
         "roughness": maps.roughness,
         "metallic": maps.metallic,
         "alpha": maps.alpha,
         "specular": image.specular,
         "diffuse": image.diffuse,
-    }[name]
+    }[kind]
     return [value] if isinstance(value, mi.Float) else [*value]
 
 

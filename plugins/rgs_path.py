@@ -43,7 +43,7 @@ from rgs_mi.plugins.surfels import box_of, surfels_in
 
 from rgs_mi.core.errors import UserError
 from rgs_mi.shading.monte_carlo import SpecularLobe, WholeLobe
-from rgs_mi.surfels.ray_tracing import SurfelRays
+from rgs_mi.surfels.ray_tracing import SurfelRayTracer
 
 DIFFUSE = ("radiance", "lit")
 _NO_LIMIT = 0xFFFFFFFF
@@ -67,7 +67,7 @@ class PathIntegrator(mi.SamplingIntegrator):
     @dr.syntax
     def sample(self, scene, sampler, ray, medium=None, active=True):
         surfels, eta = surfels_in(scene)
-        surfel_rays, lit = SurfelRays(surfels, self.box), self.diffuse == "lit"
+        surfel_rays, lit = SurfelRayTracer(surfels, self.box), self.diffuse == "lit"
         lobe_of = WholeLobe if lit else SpecularLobe
         context = mi.BSDFContext()
         hides = self.hide_emitters
@@ -81,9 +81,9 @@ class PathIntegrator(mi.SamplingIntegrator):
         while active:
             # ---- What the ray meets: a surfel, or a shape behind those that it passed ----
             pi = scene.ray_intersect_preliminary(ray, active=active)
-            reach = dr.select(pi.is_valid(), pi.t, dr.largest(mi.Float))
-            met = surfel_rays.meet(ray, dr.minimum(reach, ray.maxt), left_surfel, sampler.next_1d(active), active)
-            on_surfel = active & met.found
+            maxt = dr.select(pi.is_valid(), pi.t, dr.largest(mi.Float))
+            hit = surfel_rays.intersect(ray, dr.minimum(maxt, ray.maxt), left_surfel, sampler.next_1d(active), active)
+            on_surfel = active & hit.found
             active_shape = active & ~on_surfel
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active_shape)
 
@@ -94,15 +94,15 @@ class PathIntegrator(mi.SamplingIntegrator):
             L += dr.select(shown, β * _mis(prev_pdf, emitter_pdf) * ds.emitter.eval(si, shown), 0)
             seen |= on_surfel | (active_shape & si.is_valid())
 
-            si[on_surfel] = _interaction(ray, met)
+            si[on_surfel] = _interaction(ray, hit)
             if dr.hint(not lit, mode="scalar"):
-                L += dr.select(on_surfel, β * surfel_rays.radiance(met.number, ray.d, on_surfel), 0)
+                L += dr.select(on_surfel, β * surfel_rays.radiance(hit.index, ray.d, on_surfel), 0)
             active &= (on_surfel | si.is_valid()) & (depth + 1 < self.max_depth)
             on_surfel &= active
             active_shape &= active
 
             # ---- Emitter sampling ----
-            lobe = lobe_of(met.roughness, met.metallic, met.base_color, eta)
+            lobe = lobe_of(hit.roughness, hit.metallic, hit.base_color, eta)
             bsdf = si.bsdf(ray)
             active_em = active & (on_surfel | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
             ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, active_em)
@@ -148,10 +148,10 @@ class PathIntegrator(mi.SamplingIntegrator):
         return f"PathIntegrator[diffuse = {self.diffuse}]"
 
 
-def _interaction(ray, met):
+def _interaction(ray, hit):
     """The surface of surfels that a ray met."""
     si = dr.zeros(mi.SurfaceInteraction3f)
-    si.t, si.p, si.n = met.t, ray(met.t), mi.Normal3f(met.normal)
+    si.t, si.p, si.n = hit.t, ray(hit.t), mi.Normal3f(hit.normal)
     si.sh_frame = mi.Frame3f(si.n)
     si.wi = si.to_local(-ray.d)
     si.wavelengths = ray.wavelengths

@@ -44,7 +44,7 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 
-from rgs_mi.core.bounding_box import Box
+from rgs_mi.core.bounding_box import BoundingBox
 from rgs_mi.core.errors import UserError
 from rgs_mi.shading.split_sum import DEFAULT_ETA
 from rgs_mi.surfels.ply import read_ply
@@ -158,10 +158,10 @@ def _concatenate(clouds):
 
 
 def box_of(props):
-    """The property ``box`` of an integrator as a `Box`, None where it has none. Raises: UserError for a bad one."""
+    """The property ``box`` of an integrator as a `BoundingBox`, None where it has none. Raises: UserError for a bad one."""
     text = props.get("box", "")
     try:
-        return Box.of(text.replace(",", " ").split()) if text else None
+        return BoundingBox.of(text.replace(",", " ").split()) if text else None
     except ValueError as error:
         raise UserError(f"box '{text}': {error}") from error
 

@@ -42,7 +42,7 @@ def main():
         type=int,
         default=1,
         metavar="N",
-        help="fits at a time, which share the cores, and with them the views per second (default: %(default)s)",
+        help="fits at a time, which share the cores, and with them the FPS (default: %(default)s)",
     )
     suite.add_argument(
         "--out",

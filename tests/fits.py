@@ -7,7 +7,7 @@ import numpy as np
 from rgs_mi.datasets.types import Dataset, View
 from rgs_mi.fit import losses
 from rgs_mi.fit.model import Model
-from rgs_mi.settings.settings import Density, Settings, Stage, Start
+from rgs_mi.settings.settings import Density, Initialization, Settings, Stage
 from rgs_mi.shading import deferred
 from rgs_mi.shading.split_sum import SplitSum
 from rgs_mi.surfels.surfels import Surfels
@@ -15,7 +15,11 @@ from rgs_mi.surfels.surfels import Surfels
 from scenes import orbit_camera, sphere_surfels
 
 SETTINGS = Settings(
-    minutes=None, iterations=40, stages=(Stage(1.0, 1, 1),), start=Start(surfels=300), density=Density(start=1.0)
+    minutes=None,
+    iterations=40,
+    stages=(Stage(1.0, 1, 1),),
+    initialization=Initialization(surfels=300),
+    density=Density(start=1.0),
 )
 
 

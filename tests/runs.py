@@ -14,7 +14,7 @@ from rgs_mi.fit import losses
 ROOT = Path(__file__).parents[1]
 TARGET = """<scene version="3.0.0">
     <integrator type="path"> <boolean name="hide_emitters" value="true"/> </integrator>
-    <emitter type="procedural_envmap"> <string name="name" value="studio"/> <integer name="resolution" value="32"/>
+    <emitter type="procedural_envmap"> <string name="name" value="studio"/> <integer name="height" value="32"/>
         <transform name="to_world"> <rotate x="1" angle="90"/> </transform> </emitter>
     <shape type="sphere">
         <bsdf type="principled"> <rgb name="base_color" value="0.6, 0.4, 0.2"/> <float name="metallic" value="1"/>
@@ -30,7 +30,7 @@ def make_inputs(folder: Path, size=32) -> tuple[Path, Path]:
     (folder / "ball.xml").write_text(TARGET)
     data = render_dataset(folder / "ball.xml", folder / "ball", train=12, test=3, size=size, spp=4, radius=6, quiet=True)
     text = (ROOT / "scenes" / "object.xml").read_text()
-    (folder / "object.xml").write_text(text.replace('name="rows" value="256"', 'name="rows" value="16"'))
+    (folder / "object.xml").write_text(text.replace('name="height" value="256"', 'name="rows" value="16"'))
     return folder / "object.xml", data
 
 
@@ -41,7 +41,7 @@ def make_suite(scene: Path, data: Path, folder: Path, *names) -> tuple[Path, Pat
     return scene, folder
 
 
-SMALL = ["iterations=20", "start.surfels=300", "checkpoint_seconds=0", "stages=[{views: 2}]"]  # fitted in seconds
+SMALL = ["iterations=20", "initialization.surfels=300", "checkpoint_seconds=0", "stages=[{views: 2}]"]  # fitted in seconds
 PATIENCE = 100  # seconds, on a busy machine
 _started = []
 

@@ -33,9 +33,9 @@ class Variant:
 
 
 #: What surfels at random lack: the shape that masks agree on, and rates for normals that are nearly right.
-HULL = ("start.hull=true", "start.carve=false", "rates.rotations=[2e-3,2e-4]")
+HULL = ("initialization.hull=true", "initialization.carve=false", "learning_rates.rotations=[2e-3,2e-4]")
 #: The shape that photographs agree on, too.
-STEREO = (*HULL, "start.carve=true")
+STEREO = (*HULL, "initialization.carve=true")
 #: Cross-view shape consistency regularisation; in the paper's loss it stands in the place of 2DGS's own consistency.
 CSCR = (
     *STEREO,
@@ -44,7 +44,7 @@ CSCR = (
     "weights.crease=0",
     "weights.delta_normal=1e-3",
     "weights.consistency=[0,0]",
-    "rates.delta_normal=[1e-3,1e-4]",
+    "learning_rates.delta_normal=[1e-3,1e-4]",
     "prior.name=stereo",
 )
 #: Reflection-guided densification.
@@ -62,7 +62,7 @@ VARIANTS = {
     "lean": Variant(
         "full, at most 11 000 surfels",
         "deferred2dgs",
-        (*CSCR, *RD, "start.surfels=8000", "density.max_surfels=11000"),
+        (*CSCR, *RD, "initialization.surfels=8000", "density.max_surfels=11000"),
         "baseline",
         2,
     ),
@@ -71,7 +71,7 @@ VARIANTS = {
     "no-depth": Variant("full, no depth prior", "deferred2dgs", (*CSCR, *RD, "weights.depth=0"), "full", 2),
     "no-normal": Variant("full, no L_normal", "deferred2dgs", (*CSCR, *RD, "weights.normal=0"), "full", 2),
     "no-delta-normal": Variant(
-        "full, no Δn", "deferred2dgs", (*CSCR, *RD, "weights.delta_normal=0", "rates.delta_normal=[0,0]"), "full", 2
+        "full, no Δn", "deferred2dgs", (*CSCR, *RD, "weights.delta_normal=0", "learning_rates.delta_normal=[0,0]"), "full", 2
     ),
 }
 

@@ -15,7 +15,7 @@ from ..core.errors import UserError
 from ..fit.scene import FitScene
 from ..fit.trainer import Fit
 from ..splat.composite import Layout, composite
-from ..splat.intersect import lane_lists
+from ..splat.intersect import isect_tiles
 from ..splat.project import project
 from ..surfels.surfels import Surfels, rotation_from_normal
 from .optimize import start
@@ -74,8 +74,8 @@ def splat_times(surfels: Surfels, size: int) -> dict[str, float]:
     dr.eval(projected.geometry, projected.visible, features)
     layout = Layout(camera.size, FEATURES)
     adjoint = mi.Float(rng.normal(size=size * size * layout.pixel).astype(np.float32))
-    times = {"lists": _milliseconds(lambda: lane_lists(projected, camera.size, layout.cutoffs))}
-    lists = lane_lists(projected, camera.size, layout.cutoffs)
+    times = {"lists": _milliseconds(lambda: isect_tiles(projected, camera.size, layout.cutoffs))}
+    lists = isect_tiles(projected, camera.size, layout.cutoffs)
     times["forward"] = _milliseconds(lambda: dr.eval(composite(projected, features, lists, layout)))
 
     inputs = [*projected.geometry, *features]
@@ -132,7 +132,7 @@ def step(path, data, count=15_000, steps=20, overrides=()):
     settings = scene.settings(
         None,
         [
-            f"start.surfels={count}",
+            f"initialization.surfels={count}",
             "iterations=10000000",
             "density.start=1",
             "sh_start=0",

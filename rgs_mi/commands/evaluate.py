@@ -103,7 +103,7 @@ def _photographs(folder, scene, run):
     if not isinstance(folder, str | Path):
         raise UserError(f"{run / results.METRICS} does not say where the photographs are: give their folder with --data")
     dataset = load_dataset(folder)
-    views, sensors = results.judged(dataset), scene.sensors()
+    views, sensors = results.evaluation_views(dataset), scene.sensors()
     same = [sensor_id(view.name) for view in views] == [sensor.id() for sensor in sensors]
     if not same or not all(map(_sees_the_same, views, sensors)):
         raise UserError(f"{folder}: its test views are not those of {run}: give the folder of its photographs with --data")

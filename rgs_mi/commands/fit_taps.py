@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import lanes
+from ..core.arrays import as_float
 from ..core.files import atomic_file
 from ..core.progress import Progress
 from ..evaluation.metrics import relative_error
@@ -16,7 +16,7 @@ from ..shading.split_sum import DEFAULT_ETA, SplitSum
 from ..shading.taps import COUNT, SHAPE
 
 _ROWS = 256  # of the environments
-_LANES, _SAMPLES = 12_000, 1024
+_SURFACES, _SAMPLES = 12_000, 1024
 _RATES = (0.03, 1e-3)  # first and last
 #: What the taps are tabled for, at both ends of φ and between: (metallic, base colour).
 _MATERIALS = ((0.0, 0.0), (1.0, 1.0), (0.0, 0.0), (1.0, 0.5), (0.0, 0.0), (1.0, 0.95), (0.0, 0.0), (1.0, 0.2))
@@ -48,14 +48,14 @@ def fit_taps(path, environments: int, steps: int, seed: int):
     for k in range(COUNT):
         start[k, ..., 0] = 0.1 * (k - (COUNT - 1) / 2)
     optimizer = mi.ad.Adam(lr=_RATES[0])
-    optimizer["taps"] = lanes(start)
+    optimizer["taps"] = as_float(start)
     with Progress(None, False, "fitting") as progress:
         for step in range(steps):
             optimizer.set_learning_rate(_RATES[0] * (_RATES[1] / _RATES[0]) ** (step / steps))
             some = data[step % len(data)]
-            level = dr.opaque(mi.Float, float(0.2 * dr.sum(some.truth.y)[0] / _LANES))
+            level = dr.opaque(mi.Float, float(0.2 * dr.sum(some.truth.y)[0] / _SURFACES))
             relative = (some.estimate(optimizer["taps"]) - some.truth) / (some.truth + level)
-            dr.backward(dr.sum(dr.sum(dr.sqrt(dr.square(relative) + 1e-4))) / _LANES)
+            dr.backward(dr.sum(dr.sum(dr.sqrt(dr.square(relative) + 1e-4))) / _SURFACES)
             optimizer.step()
             progress.update((step + 1) / steps)
     with atomic_file(path) as stream:
@@ -68,17 +68,17 @@ def fit_taps(path, environments: int, steps: int, seed: int):
 def sampled(texels: np.ndarray, metallic: float, base_color: float, seed: int) -> Lanes:
     """What random surfaces of all roughness, seen as a distant sphere's, reflect of ``texels`` [rows, columns, 3]."""
     rng = np.random.default_rng(seed)
-    normal = _unit(rng.normal(size=(_LANES, 3)))
-    across = rng.normal(size=(_LANES, 3))
+    normal = _unit(rng.normal(size=(_SURFACES, 3)))
+    across = rng.normal(size=(_SURFACES, 3))
     across = _unit(across - (across * normal).sum(1, keepdims=True) * normal)
-    sine = np.sqrt(rng.uniform(0, 0.998, (_LANES, 1)))
+    sine = np.sqrt(rng.uniform(0, 0.998, (_SURFACES, 1)))
     view = np.sqrt(1 - sine**2) * normal + sine * across
-    vector = lambda v: mi.Vector3f(lanes(v[:, 0]), lanes(v[:, 1]), lanes(v[:, 2]))
-    constant = lambda v: lanes(np.full(_LANES, v))
+    vector = lambda v: mi.Vector3f(as_float(v[:, 0]), as_float(v[:, 1]), as_float(v[:, 2]))
+    constant = lambda v: as_float(np.full(_SURFACES, v))
     surfaces = (
         vector(normal),
         vector(view),
-        lanes(rng.uniform(0, 1, _LANES)),
+        as_float(rng.uniform(0, 1, _SURFACES)),
         constant(metallic),
         mi.Color3f(*3 * (constant(base_color),)),
     )

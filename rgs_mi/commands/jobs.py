@@ -97,7 +97,7 @@ def photographs(xml, data, quiet):
     for view in [*dataset.train, *dataset.test]:
         for part in (view.name.encode(), view.camera.to_world.tobytes(), view.pixels.tobytes()):
             digest.update(part)
-    return digest.hexdigest(), results.shown(results.judged(dataset))[::2]
+    return digest.hexdigest(), results.preview_views(results.evaluation_views(dataset))[::2]
 
 
 def check_photographs(folder, digest):

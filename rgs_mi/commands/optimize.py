@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.bounding_box import Box
+from ..core.bounding_box import BoundingBox
 from ..core.errors import UserError
 from ..core.files import make_folder
 from ..core.interrupt import GracefulInterrupt
@@ -94,7 +94,7 @@ def _saved(folder, resume):
 
 def start(scene, dataset, settings, quiet=True) -> Fit:
     """A fit at its beginning."""
-    begin = settings.start
+    begin = settings.initialization
     points = initial_points(dataset, begin.surfels, settings.seed, begin.hull, begin.carve, quiet)
     random = points[1] is None and not (dataset.points is not None and len(dataset.points))
     opacity = begin.opacity or (_ANYWHERE if random else _ON_SURFACE)
@@ -125,7 +125,7 @@ def _with_surroundings(points, dataset, settings):
     positions, _, colors, spacing = points
     normals = np.random.default_rng((settings.seed, 2)).normal(size=positions.shape)
     near = positions, normals / np.linalg.norm(normals, axis=1, keepdims=True), colors, spacing
-    far = surroundings(dataset, settings.start.surroundings, settings.seed)
+    far = surroundings(dataset, settings.initialization.surroundings, settings.seed)
     return [np.concatenate(pair) for pair in zip(near, far)]
 
 
@@ -135,11 +135,11 @@ def _shading(scene, dataset, settings):
     Raises: UserError for a box that is none.
     """
     try:
-        box = None if settings.box is None else Box.of(settings.box)
+        box = None if settings.box is None else BoundingBox.of(settings.box)
     except ValueError as error:
         raise UserError(f"settings: box {list(settings.box)}: {error}") from error
     if box is None and not any(view.masked for view in dataset.train):
-        box = Box.seen_by([view.camera for view in dataset.train])
+        box = BoundingBox.seen_by([view.camera for view in dataset.train])
     return replace(scene.shading, box=box)
 
 
@@ -225,5 +225,5 @@ def _state(fit, folder):
 def _diverged(fit, folder):
     return UserError(
         f"the fit diverged at step {fit.step_number} (not a finite number): {folder / 'checkpoints'} has "
-        "the last good state: go on with --resume and lower rates, e.g. --set rates.centers=[1e-4,1e-5]"
+        "the last good state: go on with --resume and lower rates, e.g. --set learning_rates.centers=[1e-4,1e-5]"
     )

@@ -18,19 +18,19 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import lanes
+from ..core.arrays import as_float
 from ..core.files import atomic_file, write_png
 from ..core.scene_files import load_scene, spp_of
 from ..datasets import load_dataset
 from ..datasets.path_traced import render_dataset
 from ..evaluation import metrics
-from ..evaluation.evaluate import photograph
+from ..evaluation.evaluate import ground_truth
 from ..export.mitsuba_scene import SCENE
 from ..export.relight import relight
 from ..export.render import sensor_dict, straight, with_aovs
 from ..fit.scene import RENDERED
 from ..plugins import surfels_of
-from ..report.results import shown
+from ..report.results import preview_views
 from ..shading.environment import Environment
 
 RECOVERY = "recovery.json"
@@ -84,9 +84,9 @@ def _compare(scene, views, picture):
     for view in views:
         color = straight(_render(scene, view))
         image = color[..., :3] * color[..., 3:] + _WHITE * (1 - color[..., 3:])
-        expected = photograph(view, _WHITE)
+        expected = ground_truth(view, _WHITE)
         scores.append((metrics.psnr(image, expected), metrics.ssim(image, expected)))
-        if view in shown(views):
+        if view in preview_views(views):
             rows.append(np.concatenate([expected, image, np.clip(3 * abs(expected - image), 0, 1)], 1))
     write_png(picture, np.concatenate(rows))
     return dict(zip(("psnr", "ssim"), np.mean(scores, 0).tolist()))
@@ -136,7 +136,7 @@ def _environment(scene, true_scene, views):
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         reflected = rays - 2 * (rays * normal).sum(1, keepdims=True) * normal
         clear = ~hidden(true_scene, point, normal, reflected)
-        direction, roughness = _vectors(reflected[clear]), lanes(maps["Roughness"][inside, 0][clear])
+        direction, roughness = _vectors(reflected[clear]), as_float(maps["Roughness"][inside, 0][clear])
         with dr.suspend_grad():
             log = lambda environment: np.log(np.maximum(environment.eval(direction, roughness).numpy(), 1e-4))
             differences.append(log(ours) - log(true))
@@ -145,7 +145,7 @@ def _environment(scene, true_scene, views):
 
 
 def _vectors(v):
-    return mi.Vector3f(*map(lanes, v.T))
+    return mi.Vector3f(*map(as_float, v.T))
 
 
 def hidden(scene, point, normal, direction):

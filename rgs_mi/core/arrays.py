@@ -6,7 +6,7 @@ import numpy as np
 _ALIGNMENT = 64  # bytes: an AVX-512 register
 
 
-def lanes(values: np.ndarray):
+def as_float(values: np.ndarray):
     """``values``, flattened, as a ``mi.Float``, in memory aligned as Dr.Jit's own.
 
     Dr.Jit's LLVM backend uses a NumPy array's memory where it lies and compiles its alignment into the kernels that read it:
@@ -19,6 +19,6 @@ def lanes(values: np.ndarray):
     return mi.Float(memory[first : first + values.size])
 
 
-def tensor(values: np.ndarray):
-    """``values`` as a ``mi.TensorXf``, in memory aligned as Dr.Jit's own; see `lanes`."""
-    return mi.TensorXf(lanes(values), np.shape(values))
+def as_tensor(values: np.ndarray):
+    """``values`` as a ``mi.TensorXf``, in memory aligned as Dr.Jit's own; see `as_float`."""
+    return mi.TensorXf(as_float(values), np.shape(values))

@@ -11,14 +11,14 @@ _SIZE = 0.5  # half the box's edges, in distances of the nearest camera from wha
 
 
 @dataclass(frozen=True)
-class Box:
-    """World-space corners, ``lower`` and ``upper`` (x, y, z)."""
+class BoundingBox:
+    """World-space corners, ``min`` and ``max`` (x, y, z)."""
 
-    lower: tuple[float, float, float]
-    upper: tuple[float, float, float]
+    min: tuple[float, float, float]
+    max: tuple[float, float, float]
 
     @classmethod
-    def of(cls, numbers) -> "Box":
+    def of(cls, numbers) -> "BoundingBox":
         """From six numbers: x, y, z of the lower corner, then of the upper. Raises: ValueError where they make no box."""
         numbers = tuple(map(float, numbers))
         if len(numbers) != 6 or not all(a < b for a, b in zip(numbers[:3], numbers[3:])) or not np.isfinite(numbers).all():
@@ -26,29 +26,29 @@ class Box:
         return cls(numbers[:3], numbers[3:])
 
     @classmethod
-    def seen_by(cls, cameras) -> "Box":
+    def seen_by(cls, cameras) -> "BoundingBox":
         """A cube about the point that all ``cameras`` look at, which leaves them outside."""
-        centre, _ = looked_at(cameras)
-        half = _SIZE * max(min(np.linalg.norm(c.origin - centre) for c in cameras), 1e-3)
-        return cls(tuple(map(float, centre - half)), tuple(map(float, centre + half)))
+        center, _ = looked_at(cameras)
+        half = _SIZE * max(min(np.linalg.norm(c.origin - center) for c in cameras), 1e-3)
+        return cls(tuple(map(float, center - half)), tuple(map(float, center + half)))
 
     @property
-    def centre(self) -> np.ndarray:
+    def center(self) -> np.ndarray:
         """[3]"""
-        return (np.array(self.lower) + self.upper) / 2
+        return (np.array(self.min) + self.max) / 2
 
     @property
     def radius(self) -> float:
         """Half the longest edge."""
-        return float(np.subtract(self.upper, self.lower).max() / 2)
+        return float(np.subtract(self.max, self.min).max() / 2)
 
-    def holds(self, point):
+    def contains(self, point):
         """Whether each ``mi.Point3f`` lies in it, ``mi.Bool``."""
         import drjit as dr
         import mitsuba as mi
 
-        lower, upper = (mi.Point3f(*(dr.opaque(mi.Float, v) for v in corner)) for corner in (self.lower, self.upper))
-        return dr.all((point >= lower) & (point <= upper))
+        min, max = (mi.Point3f(*(dr.opaque(mi.Float, v) for v in corner)) for corner in (self.min, self.max))
+        return dr.all((point >= min) & (point <= max))
 
     def __str__(self):
-        return " ".join(f"{v:.9g}" for v in (*self.lower, *self.upper))
+        return " ".join(f"{v:.9g}" for v in (*self.min, *self.max))

@@ -134,5 +134,5 @@ def looked_at(cameras) -> tuple[np.ndarray, float]:
     away = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [C, 3, 3] projects onto the plane across each axis
     # Where all axes are parallel the depth is free: the faint pull keeps it near the cameras.
     pull = 1e-6 * len(cameras) * np.eye(3)
-    centre = np.linalg.solve(away.sum(0) + pull, (away @ origins[:, :, None]).sum((0, 2)) + pull @ origins.mean(0))
-    return centre, max(float(np.linalg.norm(origins - centre, axis=1).max()), 1e-3)
+    center = np.linalg.solve(away.sum(0) + pull, (away @ origins[:, :, None]).sum((0, 2)) + pull @ origins.mean(0))
+    return center, max(float(np.linalg.norm(origins - center, axis=1).max()), 1e-3)

@@ -79,7 +79,7 @@ def undistorted(pixels: np.ndarray, camera: Camera, distortion: Distortion, name
     return result
 
 
-def shown(pixels: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:
+def cropped_to_valid(pixels: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:
     """The window of a photograph that has alpha everywhere, and its camera: cut row by row and column by column, each time
     the side that lacks most."""
     lacks = pixels[..., 3] == 0
@@ -114,9 +114,9 @@ def _resample(pixels, camera, distortion):
     with np.errstate(over="ignore", invalid="ignore"):
         x, y = distortion.apply(x, y)
         column, row = x * camera.focal[0] + camera.principal[0], y * camera.focal[1] + camera.principal[1]
-        shown = (column >= 0) & (column <= width) & (row >= 0) & (row <= height)
-    grid = [np.where(shown, a - 0.5, 0) for a in (row, column)]  # centres are at half integers
-    sample = lambda plane: np.where(shown, ndimage.map_coordinates(plane, grid, order=1, mode="nearest"), 0)
+        valid = (column >= 0) & (column <= width) & (row >= 0) & (row <= height)
+    grid = [np.where(valid, a - 0.5, 0) for a in (row, column)]  # centres are at half integers
+    sample = lambda plane: np.where(valid, ndimage.map_coordinates(plane, grid, order=1, mode="nearest"), 0)
 
     sdr = pixels.dtype == np.uint8
     alpha = pixels[..., 3] / np.float32(255) if sdr else pixels[..., 3]

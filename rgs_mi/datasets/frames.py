@@ -10,7 +10,7 @@ import numpy as np
 
 from ..core.camera import Camera
 from ..core.errors import UserError
-from .distortion import Distortion, shown, undistorted
+from .distortion import Distortion, cropped_to_valid, undistorted
 from .images import check_proportions, read_image, read_normal, with_mask
 from .points import FARTHEST
 from .types import View
@@ -147,6 +147,6 @@ def _load_view(frame: Frame) -> View:
     if frame.distortion:
         pixels = undistorted(pixels, camera, frame.distortion, frame.name)
         if not masked:
-            pixels, camera = shown(pixels, camera)
+            pixels, camera = cropped_to_valid(pixels, camera)
     normal = read_normal(frame.normal, pixels, frame.where) if frame.normal and not frame.distortion else None
     return View(frame.name, camera, pixels, masked, normal, frame.path)

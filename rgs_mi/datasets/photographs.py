@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import lanes
+from ..core.arrays import as_float
 from ..core.color import display
 from .images import resize
 
@@ -45,12 +45,12 @@ class Photographs:
             # Half precision keeps colours; of depths it would make steps.
             self._images[i] = window[:4].astype(np.float16), window[4:].copy(), whole.shape[1::-1]
         color, depth, size = self._images[i]
-        planes = [lanes(plane) for plane in color]
+        planes = [as_float(plane) for plane in color]
         return Photograph(
             camera.resized(*size).cropped(x, y, width, height),
             mi.Color3f(*planes[:3]) + self.background * (1 - planes[3]),
             planes[3],
-            lanes(depth) if len(depth) else None,
+            as_float(depth) if len(depth) else None,
             bool(self.priors and self.priors[i].inverse),
             size,
         )

@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import lanes
+from ..core.arrays import as_float
 from ..core.color import display
 from ..fit import losses
 from ..shading import deferred
@@ -23,7 +23,7 @@ class Rendering:
 
     image:  [H, W, 3] display values in [0, 1] over the background, what is compared with the photograph
     alpha:  [H, W, 1] coverage
-    maps:   name -> [H, W, channels], premultiplied by coverage: color, diffuse, specular (linear radiance), normal
+    maps:   name -> [H, W, channels], premultiplied by coverage: color, diffuse, specular (linear radiance), sh_normal
             (world space, unit length before), base_color, roughness, metallic, depth
     """
 
@@ -46,7 +46,7 @@ def render_view(surfels, lighting, camera, background, spp=1) -> Rendering:
             "color": image.color,
             "diffuse": image.diffuse,
             "specular": image.specular,
-            "normal": normal,
+            "sh_normal": normal,
             "base_color": m.base_color,
             "roughness": m.roughness,
             "metallic": m.metallic,
@@ -57,14 +57,14 @@ def render_view(surfels, lighting, camera, background, spp=1) -> Rendering:
         samples = {k: np.atleast_2d(v.numpy()).T.reshape(height, side, width, side, -1) for k, v in maps.items()}
         means = {k: v.mean((1, 3)) for k, v in samples.items()}
         alpha = means.pop("alpha")
-        length = np.linalg.norm(means["normal"], axis=-1, keepdims=True)
-        means["normal"] *= alpha / np.where(length > 0, length, 1)
-        color = mi.Color3f(*(lanes(means["color"][..., k]) for k in range(3)))
-        shown = losses.display(color, lanes(alpha), background).numpy().T.reshape(height, width, 3)
+        length = np.linalg.norm(means["sh_normal"], axis=-1, keepdims=True)
+        means["sh_normal"] *= alpha / np.where(length > 0, length, 1)
+        color = mi.Color3f(*(as_float(means["color"][..., k]) for k in range(3)))
+        shown = losses.display(color, as_float(alpha), background).numpy().T.reshape(height, width, 3)
     return Rendering(np.clip(shown, 0, 1), alpha, means)
 
 
-def photograph(view, background) -> np.ndarray:
+def ground_truth(view, background) -> np.ndarray:
     """[H, W, 3] the photograph of ``view`` as `Rendering.image` has it."""
     return display(view.pixels, background)
 
@@ -77,7 +77,7 @@ def score(view, rendering: Rendering, background) -> dict:
     Raises: UserError where the weights are damaged.
     """
     distance = lpips.distance if lpips.installed() else lambda *_: float("nan")
-    pair = rendering.image, photograph(view, background)
+    pair = rendering.image, ground_truth(view, background)
     figures = dict.fromkeys(SCORES) | {
         "psnr": metrics.psnr(*pair),
         "ssim": metrics.ssim(*pair),
@@ -87,7 +87,7 @@ def score(view, rendering: Rendering, background) -> dict:
     if view.normal is not None:
         pair = _normal_pictures(view, rendering)
         figures |= {
-            "normal_mae_deg": _finite(metrics.normal_mae_deg(rendering.maps["normal"], view.normal, view.alpha)),
+            "normal_mae_deg": _finite(metrics.normal_mae_deg(rendering.maps["sh_normal"], view.normal, view.alpha)),
             "normal_ssim": metrics.ssim(*pair),
             "normal_lpips": _finite(distance(*pair, "vgg")),
         }
@@ -98,7 +98,7 @@ def _normal_pictures(view, rendering):
     """The normals of the rendering and the view's, [H, W, 3] each."""
     unknown = (np.linalg.norm(view.normal, axis=-1) < 0.5) & (view.alpha > 0)
     alphas = np.where(unknown, 0, [rendering.alpha[..., 0], view.alpha])
-    normals = np.where(unknown[..., None], 0, [rendering.maps["normal"], view.normal * view.alpha[..., None]])
+    normals = np.where(unknown[..., None], 0, [rendering.maps["sh_normal"], view.normal * view.alpha[..., None]])
     return tuple(map(metrics.normal_colors, normals, alphas))
 
 

@@ -6,7 +6,7 @@ from PIL import Image, ImageDraw, ImageFont
 from ..core.color import srgb_encode, to_8bit, tone_map
 from ..core.files import atomic_file, write_exr, write_png
 from . import metrics
-from .evaluate import Rendering, photograph
+from .evaluate import Rendering, ground_truth
 
 ERROR_GAIN = 4  # of the absolute error in comparisons
 ERROR_RANGE, NORMAL_RANGE = 0.2, 20  # what the ramp of errors ends at: display values, degrees
@@ -30,7 +30,7 @@ _ON_SHEET = (
 def write_view(folder, view, rendering: Rendering, background, gbuffer: bool):
     """``NAME.png`` (the rendering), ``NAME_compare.png`` (photograph, rendering, `ERROR_GAIN` times the error), and
     where asked ``NAME_gbuffer.exr`` (linear maps premultiplied by coverage; normals in world space)."""
-    truth = photograph(view, background)
+    truth = ground_truth(view, background)
     error = np.abs(rendering.image - truth) * ERROR_GAIN
     write_png(folder / f"{view.name}.png", rendering.image)
     write_png(folder / f"{view.name}_compare.png", np.concatenate([truth, rendering.image, error], 1))
@@ -39,7 +39,7 @@ def write_view(folder, view, rendering: Rendering, background, gbuffer: bool):
         names = [
             f"{name}.{c}"
             for name, m in maps.items()
-            for c in ("Y" if m.shape[-1] == 1 else "XYZ" if name == "normal" else "RGB")
+            for c in ("Y" if m.shape[-1] == 1 else "XYZ" if name == "sh_normal" else "RGB")
         ]
         write_exr(folder / f"{view.name}_gbuffer.exr", np.concatenate(list(maps.values()), -1), names)
 
@@ -50,12 +50,12 @@ def write_view(folder, view, rendering: Rendering, background, gbuffer: bool):
 def panels(view, rendering: Rendering, background) -> dict[str, np.ndarray]:
     """A view taken apart: name -> [H, W, 3] uint8 over white, all cropped to the object.
 
-    ``photograph``, ``rendering``; ``error`` (mean absolute difference of display values, from 0 to `ERROR_RANGE`);
+    ``ground_truth``, ``rendering``; ``error`` (mean absolute difference of display values, from 0 to `ERROR_RANGE`);
     ``normals`` and, where the view has them, ``true normals`` (world space) and ``normal error`` (angle, from 0 to
     `NORMAL_RANGE`); ``depth`` (along the axis, near is light); ``roughness``, ``metallic``, ``base color``; ``diffuse`` and
     ``specular`` radiance, clipped.
     """
-    alpha, maps, truth = rendering.alpha, rendering.maps, photograph(view, background)
+    alpha, maps, truth = rendering.alpha, rendering.maps, ground_truth(view, background)
     over_white = lambda premultiplied: premultiplied + (1 - alpha)
     mean = lambda name: maps[name] / np.maximum(alpha, 1e-6)
     light = lambda name: over_white(srgb_encode(np.clip(mean(name), 0, 1)) * alpha)
@@ -63,12 +63,12 @@ def panels(view, rendering: Rendering, background) -> dict[str, np.ndarray]:
         "photograph": truth,
         "rendering": rendering.image,
         "error": ramp(np.abs(rendering.image - truth).mean(-1) / ERROR_RANGE),
-        "normals": metrics.normal_colors(maps["normal"], alpha[..., 0]),
+        "normals": metrics.normal_colors(maps["sh_normal"], alpha[..., 0]),
     }
     if view.normal is not None:
         known = np.linalg.norm(view.normal, axis=-1, keepdims=True) > 0.5
         images["true normals"] = metrics.normal_colors(view.normal * known, known[..., 0])
-        angles = metrics.normal_angles_deg(maps["normal"], view.normal)
+        angles = metrics.normal_angles_deg(maps["sh_normal"], view.normal)
         images["normal error"] = np.where(known, ramp(angles / NORMAL_RANGE), 1)
     images |= {
         "depth": over_white(alpha * _nearness(mean("depth"), alpha > 0.5)).repeat(3, -1),

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import tensor
+from ..core.arrays import as_tensor
 from ..core.errors import UserError
 from ..plugins import surfels_of
 from ..targets import environments
@@ -69,5 +69,5 @@ def edit(scene, path, changes):
         if len(values) not in (1, MATERIAL[name]) or not all(0 <= v <= 1 for v in values):
             raise UserError(f"--set {change}: needs {MATERIAL[name]} number(s) from 0 to 1")
         count = dr.width(params[name].array) // MATERIAL[name]
-        params[name] = tensor(np.broadcast_to(np.float32(values), (count, MATERIAL[name])))
+        params[name] = as_tensor(np.broadcast_to(np.float32(values), (count, MATERIAL[name])))
     params.update()

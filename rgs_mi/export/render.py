@@ -23,7 +23,7 @@ from .relight import edit, relight
 
 _PASS = 16  # samples per pixel at a time
 _MOST = 10_000  # frames
-AOVS = ("albedo", "roughness", "metallic", "normal", "depth", "diffuse", "specular", "alpha")
+AOVS = ("albedo", "roughness", "metallic", "sh_normal", "depth", "diffuse", "specular", "alpha")
 
 
 def render_scene(

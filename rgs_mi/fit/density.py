@@ -47,10 +47,10 @@ def densify(model, gradients: Gradients, extent: float | np.ndarray, settings, r
     if not keep.any():
         return
 
-    hot = np.flatnonzero(keep & (gradient > settings.threshold))
+    hot = np.flatnonzero(keep & (gradient > settings.grow_grad2d))
     room = max(0, budget - int(keep.sum()))
     hot = np.sort(hot[np.argsort(-gradient[hot], kind="stable")][:room])
-    large = largest > settings.dense * extent
+    large = largest > settings.grow_scale3d * extent
     split, clone = hot[large[hot]], hot[~large[hot]]
 
     stay = np.flatnonzero(keep)
@@ -63,12 +63,12 @@ def densify(model, gradients: Gradients, extent: float | np.ndarray, settings, r
     # Each surfel has its own draw: one that is split in this run and not in the next changes nothing for the others.
     parents = np.isin(stay, split)
     halves = np.concatenate([np.flatnonzero(parents), np.arange(len(stay) + len(clone), len(index))])
-    (t_u, t_v), slopes = ([v.numpy().T[index[halves]] for v in pair] for pair in _tangents(model))
+    (t_u, t_v), normal_derivatives = ([v.numpy().T[index[halves]] for v in pair] for pair in _tangents(model))
     draws = rng.normal(size=(2, len(model), 2)).astype(np.float32)
     u, v = np.concatenate([draws[0, stay[parents]], draws[1, split]]).T[..., None]
     s_u, s_v = scales[index[halves], :, None].transpose(1, 0, 2)
     changes["centers"][halves] += u * s_u * t_u + v * s_v * t_v
-    changes["delta_normal"][halves] += u * slopes[0] + v * slopes[1]
+    changes["delta_normal"][halves] += u * normal_derivatives[0] + v * normal_derivatives[1]
     changes["curvature"][halves] /= _SPLIT_SCALE
     changes["log_scales"][halves] -= np.log(_SPLIT_SCALE)
     # Two surfels on one spot cover as much as one did: 1 − (1 − o')² = o.
@@ -81,4 +81,4 @@ def _tangents(model):
     """(t_u, t_v) and (∂n/∂u, ∂n/∂v) of all surfels."""
     surfels: Surfels = model.surfels(0)
     with dr.suspend_grad():
-        return surfels.frames()[:2], surfels.slopes()
+        return surfels.frames()[:2], surfels.normal_derivatives()

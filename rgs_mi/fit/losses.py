@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import lanes
+from ..core.arrays import as_float
 from ..shading.deferred import COVERED
 from ..splat.hit import adding
 from ..splat.project import opaque
@@ -13,7 +13,7 @@ SATURATED = 0.995  # display value from which a photograph only says "at least t
 _WINDOW, _SIGMA = 11, 1.5  # SSIM's Gaussian window
 _C1, _C2 = 0.01**2, 0.03**2
 _SLOPE = 4.0  # change of log radiance per radian up to which it counts by its square
-_APART, _BEND = 0.015, 0.015  # of `fairness`: part of the image's width; radians
+_APART, _BEND = 0.015, 0.015  # of `minimum_variation`: part of the image's width; radians
 _FLAT = 1e-6  # standard deviation of a depth map, in units of its depth, up to which it is constant
 
 
@@ -142,7 +142,7 @@ def normal_smoothness(gbuffer, reflective, crease=0.0):
     if dr.width(index) == 0:
         return mi.Float(0)
     total, pairs, here = mi.Float(0), mi.Float(0), gbuffer.maps(index).normal
-    mask = lanes(reflective)
+    mask = as_float(reflective)
     inside = lambda i: dr.gather(mi.Float, mask, i) > 0
     for step in (1, width):
         d2 = dr.squared_norm(gbuffer.maps(index + step).normal - here)
@@ -152,7 +152,7 @@ def normal_smoothness(gbuffer, reflective, crease=0.0):
     return 2 * total / dr.maximum(pairs, 1)
 
 
-def fairness(gbuffer, reflective, corner=(0, 0)):
+def minimum_variation(gbuffer, reflective, corner=(0, 0)):
     """How fast the curvature of smooth surfaces changes (minimum-variation surfaces, Moreton and Séquin 1992). Where a flat
     mirror shows each part of the environment to few photographs, they agree with any wobble of it; held-out views don't.
 
@@ -172,7 +172,7 @@ def fairness(gbuffer, reflective, corner=(0, 0)):
         np.moveaxis(triple, axis, 0)[:apart] = np.moveaxis(triple, axis, 0)[-apart:] = False  # rolled in from the other side
         chosen = np.zeros_like(triple)
         chosen[corner[0] :: 2, corner[1] :: 2] = triple[corner[0] :: 2, corner[1] :: 2]
-        index, step = dr.compress(lanes(chosen) > 0), dr.opaque(mi.UInt32, stride)
+        index, step = dr.compress(as_float(chosen) > 0), dr.opaque(mi.UInt32, stride)
         if dr.width(index) == 0:
             continue
         here, ahead, behind = (gbuffer.maps(i) for i in (index, index + step, index - step))
@@ -212,7 +212,7 @@ def pearson_depth(depth, prior, valid, inverse=False):
     return dr.select(defined, 1 - r, 0)
 
 
-def light_variation(log_radiance):
+def environment_total_variation(log_radiance):
     """Total variation of an environment, 1/4π ∫ |∇ log L| dω per radian, summed over channels: each derivative d, along rows
     and columns, counts as √(d² + `_SLOPE`²) − `_SLOPE`: gentle slopes by their square, edges by their height.
 

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import lanes, tensor
+from ..core.arrays import as_float, as_tensor
 from ..shading.environment import Environment
 from ..shading.shader import Shader, initial_weights
 from ..surfels.surfels import SH_0, Surfels
@@ -52,7 +52,7 @@ class Model:
         self.rotation, self.two_sided = np.asarray(rotation, np.float64), bool(two_sided)
         self.optimizer = mi.ad.Adam(lr=1e-3, epsilon=_EPSILON)
         for name, value in parameters.items():
-            self.optimizer[name] = tensor(value)
+            self.optimizer[name] = as_tensor(value)
 
     @classmethod
     def start(
@@ -147,7 +147,7 @@ class Model:
         """Replace a parameter; its moments start again from zero, or stay where ``reset`` is off (same shape)."""
         moments = self.optimizer.state[name][3]
         del self.optimizer[name]
-        self.optimizer[name] = tensor(value)
+        self.optimizer[name] = as_tensor(value)
         if not reset:
             self._set_moments(name, *moments[:3])
 
@@ -160,7 +160,7 @@ class Model:
             t, m, v, _ = self.optimizer.state[name][3]
             moments = [x.numpy().reshape(value.shape)[index] * ~fresh[:, None] for x in (m, v)]
             self.set(name, changes.get(name, value[index]))
-            self._set_moments(name, t, *map(lanes, moments))
+            self._set_moments(name, t, *map(as_float, moments))
 
     def refine_environment(self):
         """Twice as many rows and columns of environment, on which the logarithm of radiance and its moments are as before:
@@ -168,7 +168,7 @@ class Model:
         value = self.optimizer[ENVIRONMENT]
         t, m, v, _ = self.optimizer.state[ENVIRONMENT][3]
         finer = lambda texels: Environment(mi.TensorXf(texels, value.shape), self.rotation).finer().texels
-        m, v = (lanes(finer(moment).numpy().ravel() * part) for moment, part in ((m, 1 / 4), (v, 1 / 16)))
+        m, v = (as_float(finer(moment).numpy().ravel() * part) for moment, part in ((m, 1 / 4), (v, 1 / 16)))
         self.set(ENVIRONMENT, finer(dr.detach(value).array).numpy())
         self._set_moments(ENVIRONMENT, t, m, v)
 
@@ -198,5 +198,5 @@ class Model:
         flat = {"curvature": np.zeros((len(arrays["centers"]), 3))}  # as in checkpoints of version 0.1.0
         model = cls(flat | {name: arrays[name] for name in names}, arrays["rotation"], arrays["two_sided"])
         for name in names:
-            model._set_moments(name, mi.UInt32(int(arrays[f"{name}.t"])), *(lanes(arrays[f"{name}.{k}"]) for k in "mv"))
+            model._set_moments(name, mi.UInt32(int(arrays[f"{name}.t"])), *(as_float(arrays[f"{name}.{k}"]) for k in "mv"))
         return model

@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import lanes
+from ..core.arrays import as_float
 from ..datasets.photographs import Photographs
 from ..shading import deferred
 from ..shading.deferred import Shading
@@ -22,7 +22,7 @@ from .density import Gradients, densify
 from .model import ENVIRONMENT, SHADER, Model
 from .reflection_guided import boxes, guided, picture, reflective_mask
 
-#: Rate of each parameter: the field of `Rates` that it obeys.
+#: Rate of each parameter: the field of `LearningRates` that it obeys.
 _RATES = {
     "centers": "centers",
     "rotations": "rotations",
@@ -62,7 +62,7 @@ class Fit:
         self.gradients = Gradients(len(model))
         self.photographs = None
         # What reflected rays meet; the surfels' share of diffuse light; what samples the light
-        self.proxies = self.share = self.emitter = None
+        self.proxies = self.irradiance_visibility = self.emitter = None
         self._reflective = {}  # (camera, boxes) of what was reflective when a view was last seen
         self.psnr, self.failures = 0.0, 0
         self.curves = Curves()
@@ -86,7 +86,7 @@ class Fit:
         """The fit whose `state` this was. ``others``: ``shading``, ``priors``."""
         fit = cls(dataset, Model.from_state(arrays), settings, meta["extent"], **others)
         fit.step_number, fit.views_used, fit.elapsed = meta["step"], meta["views_used"], meta["elapsed"]
-        fit.gradients.sum, fit.gradients.count = (lanes(arrays[f"gradient_{k}"]) for k in ("sum", "count"))
+        fit.gradients.sum, fit.gradients.count = (as_float(arrays[f"gradient_{k}"]) for k in ("sum", "count"))
         fit.curves = Curves(meta.get("curves", ()))  # checkpoints of version 0.1.0 have none
         return fit
 
@@ -149,10 +149,10 @@ class Fit:
             return None
         indirect = None
         if self._sees_itself:
-            proxies, share = (self.proxies, self.share) if training else (self._proxies(surfels), None)
-            indirect = Indirect(self.settings.indirect, proxies, surfels, share)
+            proxies, visibility = (self.proxies, self.irradiance_visibility) if training else (self._proxies(surfels), None)
+            indirect = Indirect(self.settings.indirect, proxies, surfels, visibility)
         lighting = deferred.Lighting(self._estimator(training), self.model.shader(), indirect, self._lit, self.shading.box)
-        return lighting.with_share() if self._shades_itself and not training else lighting
+        return lighting.with_irradiance_visibility() if self._shades_itself and not training else lighting
 
     def _estimator(self, training):
         """Of the specular integral, by now."""
@@ -174,9 +174,13 @@ class Fit:
         """Rebuild what is used for many steps."""
         if self.step_number % _REBUILD == 0 or self.proxies is None:
             self.proxies = self._proxies(surfels) if self._sees_itself else None
-            self.share = None
+            self.irradiance_visibility = None
             if self._shades_itself:
-                self.share = self.lighting(surfels, training=True).with_share(self.step_number).indirect.share
+                self.irradiance_visibility = (
+                    self.lighting(surfels, training=True)
+                    .with_irradiance_visibility(self.step_number)
+                    .indirect.irradiance_visibility
+                )
         if self.step_number % _REBUILD == 0 or self.emitter is None:
             self.emitter = self.model.environment().emitter() if self._samples_light else None
 
@@ -209,8 +213,8 @@ class Fit:
             dr.set_grad(value, dr.select(dr.isfinite(gradient), gradient, 0))  # one overflow must not end a fit
             dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
-        if lighting and s.weights.light > 0:
-            measured.append({"loss.light": self._smooth_light()})
+        if lighting and s.weights.environment_tv > 0:
+            measured.append({"loss.environment_tv": self._smooth_light()})
         self.model.optimizer.step()
         dr.eval(measured)
         mean = {name: np.mean([float(m[name][0]) for m in measured if name in m]) for m in measured for name in m}
@@ -249,31 +253,35 @@ class Fit:
             parts["loss.distortion"] = w.distortion * losses.distortion(maps, self.extent)
         consistency = dr.opaque(mi.Float, self._scheduled(w.consistency))
         parts["loss.consistency"] = consistency * losses.depth_normal_consistency(image.gbuffer, photo.camera)
-        share = size[0] * size[1] / (photo.size[0] * photo.size[1])  # these are means over the whole photograph
-        parts = {name: share * part for name, part in parts.items()} | self._regional(i, image.gbuffer, photo)
-        error = dr.mean(dr.mean(dr.square(dr.detach(rendered) - photo.color))) * share
+        part_of_image = size[0] * size[1] / (photo.size[0] * photo.size[1])  # these are means over the whole photograph
+        parts = {name: part_of_image * part for name, part in parts.items()} | self._regional(i, image.gbuffer, photo)
+        error = dr.mean(dr.mean(dr.square(dr.detach(rendered) - photo.color))) * part_of_image
         dr.backward(sum(parts.values()) * weight)
         self.gradients.add(dr.grad(offset) / weight, image.gbuffer.seen, photo.size)
         return dr.detach(parts) | {"error": error}
 
     def _smooth_light(self):
         """Accumulate the gradient of the environment's own loss, which is returned."""
-        loss = dr.opaque(mi.Float, self.settings.weights.light) * losses.light_variation(self.model[ENVIRONMENT])
+        loss = dr.opaque(mi.Float, self.settings.weights.environment_tv) * losses.environment_total_variation(
+            self.model[ENVIRONMENT]
+        )
         dr.backward(loss)
         return dr.detach(loss)
 
     def _regional(self, i, gbuffer, photo):
-        """Losses of view ``i`` that are normalised by regions of their own: RGS's L_normal and L_depth, and fairness. Notes
-        what is reflective for density control."""
+        """Losses of view ``i`` that are normalised by regions of their own: RGS's L_normal and L_depth, and minimum variation.
+        Notes what is reflective for density control."""
         w, maps, parts = self.settings.weights, gbuffer.all, {}
-        if max(w.normal, w.fairness) > 0 or self.settings.density.guided:
+        if max(w.normal, w.minimum_variation) > 0 or self.settings.density.guided:
             mask = self._reflective_mask(gbuffer, photo.camera)
             if self.settings.density.guided:
                 self._reflective[i] = photo.camera, boxes(mask)
             if w.normal > 0:
                 parts["loss.normal"] = w.normal * losses.normal_smoothness(gbuffer, mask, w.crease)
-            if w.fairness > 0:
-                parts["loss.fairness"] = w.fairness * losses.fairness(gbuffer, mask, divmod(self.step_number % 4, 2))
+            if w.minimum_variation > 0:
+                parts["loss.minimum_variation"] = w.minimum_variation * losses.minimum_variation(
+                    gbuffer, mask, divmod(self.step_number % 4, 2)
+                )
         if w.depth > 0 and photo.prior is not None:
             covered = maps.alpha > 0.5
             depth = maps.depth / dr.select(covered, maps.alpha, 1)
@@ -292,7 +300,7 @@ class Fit:
 
     def _refine_environment(self):
         """Double the rows of an environment that is learned, up to `_MOST_ROWS`, while photographs tell more apart."""
-        if self.progress < self.settings.refine_start or not any(self.settings.rates.environment):
+        if self.progress < self.settings.refine_start or not any(self.settings.learning_rates.environment):
             return
         rows = self.model[ENVIRONMENT].shape[0]
         while 2 * rows <= _MOST_ROWS and np.sqrt(2) * rows < _ROWS_A_PIXEL * self.pixels:
@@ -309,7 +317,7 @@ class Fit:
     def _set_rates(self):
         rate = {}
         for name in self.model.optimizer.keys():
-            rate[name] = self._scheduled(getattr(self.settings.rates, _RATES[name]))
+            rate[name] = self._scheduled(getattr(self.settings.learning_rates, _RATES[name]))
         rate["centers"] *= self.extent
         # A light that has no shape yet would turn normals that the hull has right. Two-sided surfels began at random.
         if self.progress < self.settings.normals_start and not self.model.two_sided:
@@ -321,12 +329,12 @@ class Fit:
 
     def _control_density(self):
         d = self.settings.density
-        if self.step_number % d.interval:
+        if self.step_number % d.refine_every:
             return
         if d.start <= self.progress < d.stop:
             # The budget opens gradually: what is spent early goes where the coarse images, not the fine ones, need it.
             opened = (self.progress - d.start) / (d.stop - d.start)
-            first, last = self.settings.start.surfels, self.settings.max_surfels
+            first, last = self.settings.initialization.surfels, self.settings.max_surfels
             budget = int(first + opened * (last - first))
             rng = np.random.default_rng((self.settings.seed, self.step_number))
             densify(self.model, self.gradients, self._reach(), d, rng, budget, self._guided())
@@ -337,7 +345,7 @@ class Fit:
         """What is large for a surfel: the object, or the distance from it in the surroundings."""
         if self.shading.box is None:
             return self.extent
-        away = np.linalg.norm(self.model.numpy("centers") - self.shading.box.centre, axis=1)
+        away = np.linalg.norm(self.model.numpy("centers") - self.shading.box.center, axis=1)
         return np.maximum(self.extent, away)
 
     def _guided(self):

@@ -176,8 +176,8 @@ def object_box(views) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _object_box(silhouettes):
-    centre, reach = looked_at([s.camera for s in silhouettes])
-    lower, upper = centre - reach, centre + reach
+    center, reach = looked_at([s.camera for s in silhouettes])
+    lower, upper = center - reach, center + reach
     for _ in range(8):
         step = (upper - lower).max() / 40
         points, _ = _grid(lower, upper, step)
@@ -220,8 +220,8 @@ def visual_hulls(views, *resolutions: int | None) -> list[SignedField]:
 
 def _pixels_across(silhouettes, lower, upper) -> int:
     """Pixels along the longest side of a box in the typical view, within `_STEPS`."""
-    centre = (lower + upper) / 2
-    pixels = [np.mean(s.camera.focal) / np.linalg.norm(centre - s.camera.origin) for s in silhouettes]
+    center = (lower + upper) / 2
+    pixels = [np.mean(s.camera.focal) / np.linalg.norm(center - s.camera.origin) for s in silhouettes]
     return int(np.clip((upper - lower).max() * np.median(pixels), *_STEPS))
 
 

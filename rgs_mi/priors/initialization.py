@@ -36,22 +36,22 @@ def initial_points(
         if dataset.point_colors is not None:
             return positions, None, np.asarray(dataset.point_colors, np.float32)[chosen], _spacing(positions)
     else:
-        centre, reach = hull.looked_at([view.camera for view in views])
+        center, reach = hull.looked_at([view.camera for view in views])
         # Half a frame's extent at the centre, for the typical camera: inside that ball all of them see something.
         half = np.median([min(v.camera.size[k] / v.camera.focal[k] for k in (0, 1)) / 2 for v in views])
         ball = rng.normal(size=(count, 3))
         ball *= rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1, keepdims=True)
-        positions = (centre + reach * min(half, 1.0) * ball).astype(np.float32)
+        positions = (center + reach * min(half, 1.0) * ball).astype(np.float32)
     return positions, None, _colors(positions, views), _spacing(positions)
 
 
 def surroundings(dataset: Dataset, count: int, seed: int = 0):
     """Points far away for what lies behind an object without a mask: on a sphere about it, `_FAR` times as far as the
     cameras. Returns: as `initial_points`; the normals point inwards."""
-    centre, reach = hull.looked_at([view.camera for view in dataset.train])
+    center, reach = hull.looked_at([view.camera for view in dataset.train])
     outward = np.random.default_rng((seed, 1)).normal(size=(count, 3))
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
-    positions = (centre + _FAR * reach * outward).astype(np.float32)
+    positions = (center + _FAR * reach * outward).astype(np.float32)
     return positions, -outward, _colors(positions, dataset.train), _spacing(positions)
 
 

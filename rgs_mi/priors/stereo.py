@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from ..core.arrays import lanes
+from ..core.arrays import as_float
 from ..core.progress import Progress
 from ..splat.project import opaque
 from . import hull
@@ -124,10 +124,10 @@ def alikeness(here, depth, level, others, margin):
 def _points(camera, depth, level):
     """World points below the hull, a lane a level and pixel."""
     filled = np.where(np.isfinite(depth), depth, np.nanmax(depth))
-    lane, n = dr.arange(mi.UInt32, filled.size * len(level)), dr.opaque(mi.UInt32, filled.size)
-    pixel = lane % n
-    z = dr.gather(mi.Float, lanes(filled), pixel) + dr.gather(mi.Float, lanes(level), lane // n)
-    rays = mi.Vector3f(*(dr.gather(mi.Float, lanes(c), pixel) for c in np.moveaxis(camera.rays(), -1, 0)))
+    entry, n = dr.arange(mi.UInt32, filled.size * len(level)), dr.opaque(mi.UInt32, filled.size)
+    pixel = entry % n
+    z = dr.gather(mi.Float, as_float(filled), pixel) + dr.gather(mi.Float, as_float(level), entry // n)
+    rays = mi.Vector3f(*(dr.gather(mi.Float, as_float(c), pixel) for c in np.moveaxis(camera.rays(), -1, 0)))
     point = opaque(camera)[1] + rays * z
     dr.eval(point)
     return point
@@ -145,11 +145,11 @@ def _warp(points, other, depth, margin):
     inside = (local.z > 0) & (x >= 0) & (y >= 0) & (x < number(width - 1)) & (y < number(height - 1))
     column, row = dr.floor(x), dr.floor(y)
     at = mi.UInt32(dr.select(inside, row * number(width) + column, 0))
-    grey, right, below = lanes(other.grey), dr.opaque(mi.UInt32, 1), dr.opaque(mi.UInt32, width)
+    grey, right, below = as_float(other.grey), dr.opaque(mi.UInt32, 1), dr.opaque(mi.UInt32, width)
     fetch = lambda k: dr.gather(mi.Float, grey, at + k, inside)
     fx, fy = x - column, y - row
     value = dr.lerp(dr.lerp(fetch(0), fetch(right), fx), dr.lerp(fetch(below), fetch(below + right), fx), fy)
-    surface = dr.gather(mi.Float, lanes(np.where(np.isfinite(depth), depth, np.inf)), at, inside)
+    surface = dr.gather(mi.Float, as_float(np.where(np.isfinite(depth), depth, np.inf)), at, inside)
     inside &= local.z > surface - number(margin)
     value = dr.select(inside, value, 1)
     dr.eval(value, inside)
@@ -160,7 +160,7 @@ def _own(grey, levels):
     """``grey``, its means and its mean squares over windows, a lane a level and pixel."""
     pixel = dr.arange(mi.UInt32, grey.size * levels) % dr.opaque(mi.UInt32, grey.size)
     means = (ndimage.uniform_filter(grey.astype(np.float64) ** k, 2 * _WINDOW + 1, mode="nearest") for k in (1, 2))
-    own = [dr.gather(mi.Float, lanes(image), pixel) for image in (grey, *means)]
+    own = [dr.gather(mi.Float, as_float(image), pixel) for image in (grey, *means)]
     dr.eval(own)
     return own
 
@@ -178,15 +178,15 @@ def _correlation(own, warped, inside, shape):
 
 def _means(images, width, height):
     """Means over windows of stacks of images, which end at each image's borders."""
-    lane = dr.arange(mi.UInt32, dr.width(images[0]))
+    entry = dr.arange(mi.UInt32, dr.width(images[0]))
     columns, rows = dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, height)
-    for position, extent, stride in ((lane % columns, columns, 1), (lane // columns % rows, rows, columns)):
+    for position, extent, stride in ((entry % columns, columns, 1), (entry // columns % rows, rows, columns)):
         dr.eval(images)
         sums = [mi.Float(0)] * len(images)
         for offset in range(-_WINDOW, _WINDOW + 1):
             moved = mi.Int32(position) + offset
             moved = dr.clip(moved, 0, mi.Int32(extent) - 1) - mi.Int32(position)
-            at = mi.UInt32(mi.Int32(lane) + moved * mi.Int32(stride))
+            at = mi.UInt32(mi.Int32(entry) + moved * mi.Int32(stride))
             sums = [s + dr.gather(mi.Float, image, at) for s, image in zip(sums, images)]
         images = [s / (2 * _WINDOW + 1) for s in sums]
     return images

@@ -10,14 +10,14 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ..core.color import to_8bit
 from ..core.files import atomic_file
-from ..evaluation.evaluate import photograph
+from ..evaluation.evaluate import ground_truth
 from ..evaluation.metrics import normal_colors
 from ..evaluation.pictures import crop
 
 SCORES = ("psnr", "ssim", "lpips", "normal_mae_deg")  # those of `evaluate.SCORES` that tables have room for
 FIGURES = (*SCORES, "surfels", "render_fps", "train_seconds")
 DETAILS = ("iterations", "peak_rss_mb", "normal_ssim", "normal_lpips")
-_HEADER = ("PSNR", "SSIM", "LPIPS", "normals", "surfels", "views/s", "min")
+_HEADER = ("PSNR", "SSIM", "LPIPS", "normals", "surfels", "FPS", "min")
 _PANEL, _GAP, _MARGIN, _TEXT = 260, 8, 24, 20  # pixels of the picture
 _INK = (60, 60, 60)
 
@@ -201,7 +201,7 @@ def _rows(view, folders, background):
         normals = [normal_colors(view.normal * known, known[..., 0])]
     normals += [_normals(folder / f"{view.name}_gbuffer.exr") for folder in folders]
     images = [np.asarray(Image.open(folder / f"{view.name}.png"))[..., :3] / 255 for folder in folders]
-    for row in ([photograph(view, background), *images], normals):
+    for row in ([ground_truth(view, background), *images], normals):
         cropped = crop({k: image for k, image in enumerate(row) if image is not None}, view)
         yield [cropped.get(k) for k in range(len(row))]
 
@@ -212,4 +212,4 @@ def _normals(path):
 
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {name: channel.pixels for name, channel in file.channels().items()}
-    return normal_colors(np.stack([channels[f"normal.{axis}"] for axis in "XYZ"], -1), channels["alpha.Y"])
+    return normal_colors(np.stack([channels[f"sh_normal.{axis}"] for axis in "XYZ"], -1), channels["alpha.Y"])

@@ -14,7 +14,7 @@ FIGURES = {
     "normal_ssim": ("SSIM of normals", "{:.4f}", ""),
     "normal_lpips": ("LPIPS of normals", "{:.4f}", ""),
     "surfels": ("surfels", "{:,.0f}", ""),
-    "render_fps": ("views/s", "{:.1f}", ""),
+    "render_fps": ("FPS", "{:.1f}", ""),
     "train_seconds": ("time", "{}", ""),
     "iterations": ("steps", "{:,.0f}", ""),
     "peak_rss_mb": ("memory", "{:,.0f}", " MB"),

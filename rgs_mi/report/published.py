@@ -74,7 +74,7 @@ _STYLE = {
     "normal_ssim": ("SSIM", "{:.3f}"),
     "normal_lpips": ("LPIPS", "{:.3f}"),
     "surfels": ("surfels", "{:,.0f}"),
-    "render_fps": ("views/s", "{:.0f}"),
+    "render_fps": ("FPS", "{:.0f}"),
     "train_seconds": ("min", "{:.0f}"),
     "peak_rss_mb": ("MB", "{:.0f}"),
 }

@@ -19,7 +19,7 @@ from ..export.mitsuba_scene import export
 from ..settings.config import to_dict
 
 METRICS, SHEET, GUIDED = "metrics.json", "contact_sheet.png", "guided.png"
-SHOWN = 4  # test views on the sheet and in the report, and with their G-buffers written
+PREVIEWS = 4  # test views on the sheet and in the report, and with their G-buffers written
 _NO_LPIPS = f"not measured, for want of weights: {lpips.INSTALL}"
 
 
@@ -33,7 +33,14 @@ def write(fit, scene, folder, quiet):
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
         exported = export(
-            folder, scene, surfels, environment, *fit.begun, fit.model.shader(), judged(fit.dataset), fit.settings.spp
+            folder,
+            scene,
+            surfels,
+            environment,
+            *fit.begun,
+            fit.model.shader(),
+            evaluation_views(fit.dataset),
+            fit.settings.spp,
         )
         lighting = fit.lighting(surfels)
     mean, scores, rows = measure(surfels, lighting, fit.dataset, fit.settings.background, fit.settings.spp, folder, quiet)
@@ -49,8 +56,8 @@ def measure(surfels, lighting, dataset, background, spp, folder, quiet) -> tuple
     Args: see `evaluate.render_view`. Returns: the figures of quality and speed, means as metrics.json has them; its
     ``views``, {name: scores}; and {name: `pictures.panels`} of those that are shown.
     """
-    views, scores, rows = judged(dataset), {}, {}
-    on_sheet = {view.name for view in shown(views)}
+    views, scores, rows = evaluation_views(dataset), {}, {}
+    on_sheet = {view.name for view in preview_views(views)}
     with Progress(None, quiet, "evaluating") as progress:
         for k, view in enumerate(views):
             rendering = evaluate.render_view(surfels, lighting, view.camera, background, spp)
@@ -88,14 +95,14 @@ def publish(folder, figures, curves, rows, environment, others=()):
     )
 
 
-def judged(dataset) -> list:
+def evaluation_views(dataset) -> list:
     """The views that results are of: the held-out ones, or a few of those that are fitted."""
-    return dataset.test or dataset.train[:SHOWN]
+    return dataset.test or dataset.train[:PREVIEWS]
 
 
-def shown(views) -> list:
-    """The views of a list that pictures show: `SHOWN` of them, evenly spread."""
-    return [views[k] for k in sorted({int(k) for k in np.linspace(0, len(views) - 1, SHOWN + 2)[1:-1].round()})]
+def preview_views(views) -> list:
+    """The views of a list that pictures show: `PREVIEWS` of them, evenly spread."""
+    return [views[k] for k in sorted({int(k) for k in np.linspace(0, len(views) - 1, PREVIEWS + 2)[1:-1].round()})]
 
 
 def finished(folder) -> bool:
@@ -159,5 +166,5 @@ def _summary(figures) -> list[str]:
         *quality,
         f"{figures['surfels']:,} surfels".replace(",", " "),
         f"{figures['iterations']} steps in {minutes}:{seconds:02} min",
-        f"{figures['render_fps']:.1f} views per second",
+        f"{figures['render_fps']:.1f} FPS",
     ]

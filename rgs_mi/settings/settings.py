@@ -20,7 +20,7 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Start:
+class Initialization:
     """Where the fit begins."""
 
     surfels: int = _within(25_000, 1, 10_000_000)
@@ -33,7 +33,7 @@ class Start:
 
 
 @dataclass(frozen=True)
-class Rates:
+class LearningRates:
     """Adam's learning rates: the first and the last, joined geometrically. Positions are in units of the object."""
 
     centers: tuple[float, float] = (5e-4, 1e-5)
@@ -62,10 +62,12 @@ class Weights:
     distortion: float = _within(0.0, 0, 1e6)  # of the surfels along a ray (2DGS)
     normal: float = _within(0.1, 0, 1e3)  # smoothness of the normals of what is reflective (RGS, L_normal)
     crease: float = _within(0.1, 0, 1e3)  # difference of unit normals from pixel to pixel that it lets be; 0: none
-    fairness: float = _within(30.0, 0, 1e6)  # change of curvature where what is reflective is smooth
+    minimum_variation: float = _within(30.0, 0, 1e6)  # change of curvature where what is reflective is smooth
     delta_normal: float = _within(0.0, 0, 1e3)  # length of the normals' residuals (RGS, L_Δn)
     depth: float = _within(1e-3, 0, 1e3)  # correlation with the depth prior (RGS, L_depth)
-    light: float = _within(1e-5, 0, 1e3)  # total variation of the environment: what nothing reflects sharply stays smooth
+    environment_tv: float = _within(
+        1e-5, 0, 1e3
+    )  # total variation of the environment: what nothing reflects sharply stays smooth
 
 
 @dataclass(frozen=True)
@@ -82,9 +84,9 @@ class Density:
 
     start: float = _within(0.08, 0, 1)  # fraction of the fit
     stop: float = _within(0.6, 0, 1)
-    interval: int = _within(100, 1, 100_000)  # steps
-    threshold: float = _within(1e-4, 0, 1)  # positional gradient in NDC units; half of 2DGS's: rather many surfels
-    dense: float = _within(0.01, 0, 1)  # surfels smaller than this (in units of the object) are cloned, others split
+    refine_every: int = _within(100, 1, 100_000)  # steps
+    grow_grad2d: float = _within(1e-4, 0, 1)  # positional gradient in NDC units; half of 2DGS's: rather many surfels
+    grow_scale3d: float = _within(0.01, 0, 1)  # surfels smaller than this (in units of the object) are cloned, others split
     prune_opacity: float = _within(0.05, 0, 1)
     max_surfels: int | None = _within(None, 1, 10_000_000)  # unless given: see `Settings.max_surfels`
     guided: bool = False  # half the threshold where two views or more see something reflective (RGS, Algorithm 1)
@@ -120,8 +122,8 @@ class Settings:
     sh_start: float = _within(0.4, 0, 1)  # fraction of the fit from which view-dependent diffuse is learned
     checkpoint_seconds: float = _within(20, 0, 1e6)
     stages: tuple[Stage, ...] = (Stage(0.2, 2, 1), Stage(1.0, 1, 1))
-    start: Start = Start()
-    rates: Rates = Rates()
+    initialization: Initialization = Initialization()
+    learning_rates: LearningRates = LearningRates()
     weights: Weights = Weights()
     prior: Prior = Prior()
     density: Density = Density()

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from ..core.bounding_box import Box
+from ..core.bounding_box import BoundingBox
 from ..splat.gbuffer import render_gbuffer
 from ..splat.project import opaque
 from .indirect import Indirect
@@ -28,7 +28,7 @@ class Shading:
     diffuse: str = "radiance"
     samples: int = SAMPLES
     eta: float = DEFAULT_ETA
-    box: Box | None = None
+    box: BoundingBox | None = None
 
 
 @dataclass
@@ -41,49 +41,52 @@ class Lighting:
     shader: Shader | None = None
     indirect: Indirect | None = None
     lit: bool = False
-    box: Box | None = None
+    box: BoundingBox | None = None
 
     def specular(self, normal, view, roughness, metallic, base_color, point=None):
         """f_φ(C_s), radiance that surfaces reflect towards ``view``, ``mi.Color3f``; see `SplitSum.specular`. ``point``:
         where the surfaces are, which `indirect` needs (None: they reflect the environment alone)."""
-        cover = self._cover(normal, point, roughness)
-        C_s = self.estimator.specular(normal, view, roughness, metallic, base_color, cover)
+        incident_radiance = self._incident_radiance(normal, point, roughness)
+        C_s = self.estimator.specular(normal, view, roughness, metallic, base_color, incident_radiance)
         return C_s if self.shader is None else self.shader(C_s, roughness, dr.dot(normal, view))
 
-    def diffuse(self, normal, view, roughness, metallic, base_color, point=None, share=1):
-        """C_d where it is ``lit``; as `specular`. ``share``: of the light, that comes there."""
-        cover = self._cover(normal, point, roughness)
-        return self.estimator.diffuse(normal, view, roughness, metallic, base_color, cover, share)
+    def diffuse(self, normal, view, roughness, metallic, base_color, point=None, irradiance_visibility=1):
+        """C_d where it is ``lit``; as `specular`. ``irradiance_visibility``: the part of the light that comes there."""
+        incident_radiance = self._incident_radiance(normal, point, roughness)
+        return self.estimator.diffuse(
+            normal, view, roughness, metallic, base_color, incident_radiance, irradiance_visibility
+        )
 
-    def _cover(self, normal, point, roughness):
-        """What an estimator asks what comes along a direction; None: the environment's radiance does."""
+    def _incident_radiance(self, normal, point, roughness):
+        """Callback that returns incident radiance after occlusion (see `SplitSum.specular`); None means the unoccluded
+        environment."""
 
-        def cover(light, direction, lane):
-            at = lambda v: v if lane is None else dr.gather(type(v), v, lane)
+        def incident_radiance(light, direction, index):
+            at = lambda v: v if index is None else dr.gather(type(v), v, index)
             part = 1 if self.lit else dr.clip((_WIDE - at(roughness)) / (_WIDE - _NARROW), 0, 1)
-            return self.indirect.cover(light, at(point), at(normal), direction, self, part)
+            return self.indirect.incident_radiance(light, at(point), at(normal), direction, self, part)
 
-        return None if point is None else cover
+        return None if point is None else incident_radiance
 
     @property
-    def _shares(self):
-        return self.lit and self.indirect is not None and self.indirect.share is not None
+    def _has_visibility(self):
+        return self.lit and self.indirect is not None and self.indirect.irradiance_visibility is not None
 
-    def with_share(self, seed=0) -> "Lighting":
-        """The same, where the object hides some of its own light from itself; see `Indirect.with_share`."""
-        return replace(self, indirect=self.indirect.with_share(self, dr.opaque(mi.UInt32, seed)))
+    def with_irradiance_visibility(self, seed=0) -> "Lighting":
+        """The same, where the object hides some of its own light from itself; see `Indirect.with_irradiance_visibility`."""
+        return replace(self, indirect=self.indirect.with_irradiance_visibility(self, dr.opaque(mi.UInt32, seed)))
 
-    def splatted(self, surfels):
-        """``surfels`` as they are splatted: what is lit has no radiance of its own, but its share of the light."""
-        return self.indirect.carried(surfels, self.box) if self._shares else surfels
+    def as_splatted(self, surfels):
+        """The surfels to splat: what is lit has no radiance of its own, but its irradiance visibility in its place."""
+        return self.indirect.with_visibility_as_radiance(surfels, self.box) if self._has_visibility else surfels
 
-    def share(self, maps, mean):
-        """The same share in pixels of these ``maps``, which ``mean`` divides by their coverage."""
-        return maps.diffuse * mean if self._shares else 1
+    def irradiance_visibility(self, maps, mean):
+        """The irradiance visibility of pixels of these ``maps``, which ``mean`` divides by their coverage."""
+        return maps.diffuse * mean if self._has_visibility else 1
 
-    def seen_again(self) -> "Lighting":
+    def for_secondary_bounce(self) -> "Lighting":
         """The lighting of what a reflected ray meets: it reflects the environment alone."""
-        return replace(self, estimator=self.estimator.seen_again(), indirect=None)
+        return replace(self, estimator=self.estimator.for_secondary_bounce(), indirect=None)
 
     def learned(self) -> list:
         """The arrays that a fit changes: texels of the environment, and the weights of the shader where there is one."""
@@ -128,14 +131,14 @@ def shade(gbuffer, camera, lighting: Lighting | None) -> Image:
     return Image(diffuse + specular, diffuse, specular, gbuffer)
 
 
-def within(gbuffer, camera, box: Box | None):
+def within(gbuffer, camera, box: BoundingBox | None):
     """Which pixels are covered by what lies in ``box`` (None: by anything), ``mi.Bool``."""
     alpha, depth = dr.detach(gbuffer.all.alpha), dr.detach(gbuffer.all.depth)
     covered = alpha > COVERED
     if box is None:
         return covered
     directions = pixel_directions(camera, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]))
-    return covered & box.holds(_points(camera, directions, depth / dr.maximum(alpha, COVERED)))
+    return covered & box.contains(_points(camera, directions, depth / dr.maximum(alpha, COVERED)))
 
 
 def _points(camera, direction, depth):
@@ -159,12 +162,12 @@ def _reflected(gbuffer, camera, lighting):
         surfaces = normal, -direction, m.roughness * mean, m.metallic * mean, m.base_color * mean, point
         dr.scatter(specular, lighting.specular(*surfaces) * m.alpha, index)
         if lighting.lit:
-            dr.scatter(diffuse, lighting.diffuse(*surfaces, lighting.share(m, mean)) * m.alpha, index)
+            dr.scatter(diffuse, lighting.diffuse(*surfaces, lighting.irradiance_visibility(m, mean)) * m.alpha, index)
     return diffuse, specular
 
 
-def render(surfels, camera, lighting: Lighting | None, screen_offset=None, full=False) -> Image:
+def render(surfels, camera, lighting: Lighting | None, means2d_offset=None, full=False) -> Image:
     """Splat (see `render_gbuffer`) and `shade`; differentiable in the surfels' fields, the environment and the shader."""
     if lighting is not None:
-        surfels = lighting.splatted(surfels)
-    return shade(render_gbuffer(surfels, camera, screen_offset, full=full), camera, lighting)
+        surfels = lighting.as_splatted(surfels)
+    return shade(render_gbuffer(surfels, camera, means2d_offset, full=full), camera, lighting)

@@ -92,7 +92,7 @@ class FilteredEnvironment:
 
     def _level(self, longitude, colatitude, level):
         """Bilinear lookup in map number ``level`` (one a lane); longitude and colatitude in [0, 1]."""
-        # from lists: a NumPy array's memory is not aligned (see `aligned`), and one of a single number is read, not gathered
+        # from lists: a NumPy array's memory is not aligned (see `core.arrays`), and one of a single number is read, not gathered
         constant = lambda values: dr.gather(mi.UInt32, mi.UInt32([int(v) for v in values]), level)
         rows, columns = (constant([size[i] for size in self.operator.maps]) for i in (0, 1))
         first = constant(self.operator.offsets)

@@ -31,76 +31,78 @@ _BLUR = 0.5  # the roughness as whose lobe sees it the environment is taken ther
 @dataclass
 class Indirect:
     """How surfels see each other: ``kind``, `visibility` or `one_bounce`; ``proxies``, perhaps of a few steps ago; the
-    ``surfels`` as they are; and their ``share`` of diffuse light, a of (9) (None: all)."""
+    ``surfels`` as they are; and their ``irradiance_visibility`` of diffuse light, a of (9) (None: all)."""
 
     kind: str
     proxies: Proxies
     surfels: Surfels
-    share: "mi.Color3f | None" = None
+    irradiance_visibility: "mi.Color3f | None" = None
 
-    def cover(self, incoming, point, normal, direction, lighting, part=1):
+    def incident_radiance(self, incoming, point, normal, direction, lighting, part=1):
         """``incoming`` radiance along ``direction``, a lane a pixel, where nothing stands in the way; elsewhere the surfels'
         takes the place of a ``part`` of it."""
         part = mi.Float(part)
         dr.eval(incoming, point, normal, direction, part)
-        found, number, place = self.proxies.meet(*(dr.detach(v) for v in (point, normal, direction)), dr.detach(part) > 0)
-        lanes = dr.compress(found)
+        found, index, uv = self.proxies.intersect(*(dr.detach(v) for v in (point, normal, direction)), dr.detach(part) > 0)
+        indices = dr.compress(found)
         light = dr.zeros(mi.Color3f, dr.width(found))
-        if self.kind == "one_bounce" and dr.width(lanes) > 0:
-            d = mi.Vector3f(*(dr.gather(mi.Float, c, lanes, mode=dr.ReduceMode.NoConflicts) for c in direction))
-            number, place = dr.gather(mi.UInt32, number, lanes), dr.gather(mi.Point2f, place, lanes)
-            dr.scatter(light, self._radiance(number, place, d, lighting), lanes)
+        if self.kind == "one_bounce" and dr.width(indices) > 0:
+            d = mi.Vector3f(*(dr.gather(mi.Float, c, indices, mode=dr.ReduceMode.NoConflicts) for c in direction))
+            index, uv = dr.gather(mi.UInt32, index, indices), dr.gather(mi.Point2f, uv, indices)
+            dr.scatter(light, self._radiance(index, uv, d, lighting), indices)
         return dr.select(found, dr.lerp(incoming, light, part), incoming)
 
-    def with_share(self, lighting, seed) -> "Indirect":
-        """The same with `share`, where surfels are lit by ``lighting``, whose estimator is the split sum; ``seed``:
-        ``mi.UInt32``."""
+    def with_irradiance_visibility(self, lighting, seed) -> "Indirect":
+        """The same with `irradiance_visibility`, where surfels are lit by ``lighting``, whose estimator is the split sum;
+        ``seed``: ``mi.UInt32``."""
         with dr.suspend_grad():
-            share = self._share(self.surfels.normals(), lighting, seed)
+            ratio, normal = self._irradiance_visibility, self.surfels.normals()
+            visibility = ratio(normal, lighting, seed)
             if self.surfels.two_sided:  # the side that shows is the one that light reaches
-                share = dr.maximum(share, self._share(-self.surfels.normals(), lighting, seed))
-            dr.eval(share)
-        return replace(self, share=share)
+                visibility = dr.maximum(visibility, ratio(-normal, lighting, seed))
+            dr.eval(visibility)
+        return replace(self, irradiance_visibility=visibility)
 
-    def _share(self, normal, lighting, seed):
+    def _irradiance_visibility(self, normal, lighting, seed):
         n = len(self.surfels)
         index = dr.arange(mi.UInt32, n * _RAYS)
-        surfel, number = index // _RAYS, index % _RAYS
+        surfel, sample = index // _RAYS, index % _RAYS
         at = lambda v: dr.gather(type(v), v, surfel)
         normal, point = at(normal), at(self.surfels.column(mi.Vector3f, "centers"))
-        local = mi.warp.square_to_cosine_hemisphere(points(n, seed, surfel, number)[0])
+        local = mi.warp.square_to_cosine_hemisphere(points(n, seed, surfel, sample)[0])
         direction = mi.Frame3f(normal).to_world(local)
         radiance = lighting.estimator.environment.eval(direction, mi.Float(_BLUR))
-        coming = self.cover(radiance, point, normal, direction, lighting)
+        coming = self.incident_radiance(radiance, point, normal, direction, lighting)
         total = lambda color: mi.Color3f(*(dr.block_sum(c, _RAYS) for c in color))
         return total(coming) / dr.maximum(total(radiance), 1e-6)
 
-    def carried(self, surfels, box) -> Surfels:
-        """``surfels`` whose radiance is their `share`, in the ``box`` (None: everywhere), to be splatted."""
+    def with_visibility_as_radiance(self, surfels, box) -> Surfels:
+        """``surfels`` whose radiance is their `irradiance_visibility`, in the ``box`` (None: everywhere), to be splatted."""
         shape = surfels.sh.shape
         sh, row = dr.copy(surfels.sh.array), dr.arange(mi.UInt32, len(surfels)) * shape[1]
-        inside = mi.Bool(True) if box is None else box.holds(surfels.column(mi.Point3f, "centers"))
+        inside = mi.Bool(True) if box is None else box.contains(surfels.column(mi.Point3f, "centers"))
         for k in range(shape[1]):
-            dr.scatter(sh, (self.share[k] - 0.5) / SH_0 if k < 3 else mi.Float(0), row + k, inside)
+            dr.scatter(sh, (self.irradiance_visibility[k] - 0.5) / SH_0 if k < 3 else mi.Float(0), row + k, inside)
         return replace(surfels, sh=mi.TensorXf(sh, shape))
 
-    def _radiance(self, number, place, direction, lighting):
-        """What the surfels ``number`` send against ``direction`` from a ``place`` on them; they in turn reflect the
+    def _radiance(self, index, uv, direction, lighting):
+        """What the surfels ``index`` send against ``direction`` from ``uv`` on them; they in turn reflect the
         environment alone."""
-        met = self.surfels.take(number)
-        normal = met.normals(place)
-        if met.two_sided:
+        hit = self.surfels.take(index)
+        normal = hit.normals(uv)
+        if hit.two_sided:
             normal = dr.mulsign(normal, -dr.dot(direction, normal))
-        lighting = lighting.seen_again()
+        lighting = lighting.for_secondary_bounce()
         surface = (
             normal,
             -direction,
-            met.column(mi.Float, "roughness"),
-            met.column(mi.Float, "metallic"),
-            met.column(mi.Color3f, "base_color"),
+            hit.column(mi.Float, "roughness"),
+            hit.column(mi.Float, "metallic"),
+            hit.column(mi.Color3f, "base_color"),
         )
         specular = lighting.specular(*surface)
         if not lighting.lit:
-            return met.radiance(direction) + specular
-        share = 1 if self.share is None else dr.gather(mi.Color3f, self.share, number)
-        return lighting.diffuse(*surface, share=share) + specular
+            return hit.radiance(direction) + specular
+        visibility = self.irradiance_visibility
+        visibility = 1 if visibility is None else dr.gather(mi.Color3f, visibility, index)
+        return lighting.diffuse(*surface, irradiance_visibility=visibility) + specular

@@ -23,7 +23,7 @@ from .environment import FilteredEnvironment
 from .sequence import points
 
 SAMPLES = 16  # a pixel, unless someone says otherwise
-_LANES = 1 << 22  # samples at a time
+_WAVEFRONT = 1 << 22  # samples at a time
 _OTHER, _DEEPER, _DIFFUSE = 0x9E3779B9, 0x85EBCA6B, 0xC2B2AE35  # what makes of a seed another
 
 
@@ -42,16 +42,16 @@ class MonteCarlo:
     seed: "mi.UInt32"
     paired: bool = False
 
-    def specular(self, normal, view, roughness, metallic, base_color, cover=None):
+    def specular(self, normal, view, roughness, metallic, base_color, incident_radiance=None):
         """C_s of (7), ``mi.Color3f``; see `SplitSum.specular`."""
-        return self._integral(SpecularLobe, normal, view, roughness, metallic, base_color, cover)
+        return self._integral(SpecularLobe, normal, view, roughness, metallic, base_color, incident_radiance)
 
-    def diffuse(self, normal, view, roughness, metallic, base_color, cover=None, share=None):
-        """C_d of (7), ``mi.Color3f``, where ``cover`` counts, too; of a ``share`` there is no need."""
+    def diffuse(self, normal, view, roughness, metallic, base_color, incident_radiance=None, irradiance_visibility=None):
+        """C_d of (7), ``mi.Color3f``, where ``incident_radiance`` counts, too; ``irradiance_visibility`` is not needed."""
         other = replace(self, seed=self.seed ^ _DIFFUSE)
-        return other._integral(DiffuseLobe, normal, view, roughness, metallic, base_color, cover)
+        return other._integral(DiffuseLobe, normal, view, roughness, metallic, base_color, incident_radiance)
 
-    def seen_again(self) -> "MonteCarlo":
+    def for_secondary_bounce(self) -> "MonteCarlo":
         """The estimator of what a reflected ray meets: one sample is enough of what few rays see."""
         return replace(self, samples=1, seed=self.seed ^ _DEEPER, paired=False)
 
@@ -66,13 +66,13 @@ class MonteCarlo:
                 value = replace(self, paired=False, seed=self.seed ^ _OTHER)._integral(lobe, *surfaces)
             return dr.replace_grad(value, derivatives)
         n = dr.width(surfaces[0])
-        each = max(1, min(self.samples, _LANES // n))
+        each = max(1, min(self.samples, _WAVEFRONT // n))
         total = dr.zeros(mi.Color3f, n)
         for first in range(0, self.samples, each):
             total += self._sum(lobe, first, min(each, self.samples - first), *surfaces)
         return total / self.samples
 
-    def _sum(self, lobe, first, count, normal, view, roughness, metallic, base_color, cover):
+    def _sum(self, lobe, first, count, normal, view, roughness, metallic, base_color, incident_radiance):
         """Samples number ``first`` to ``first + count`` of (7), added."""
         n = dr.width(normal)
         index = dr.arange(mi.UInt32, n * count)
@@ -88,8 +88,8 @@ class MonteCarlo:
         for direction in (dr.detach(lit), bounced):
             local = si.to_local(direction)
             light = self.environment.eval(direction)
-            if cover is not None:
-                light = cover(light, direction, pixel)
+            if incident_radiance is not None:
+                light = incident_radiance(light, direction, pixel)
             density = material.pdf(si, local) + self._emitter_pdf(si, direction)
             g = material.eval(si, local) * light / density
             total += dr.select((density > 0) & (local.z > 0), g, 0)
@@ -106,7 +106,7 @@ class MonteCarlo:
 def _materials(eta: float, variant: str):
     """Principled BSDFs that are black (a dielectric), metallic, and plastic, and the textures of the latter two: their
     roughness, a lane each, and their base colour."""
-    roughness, color = mi.load_dict({"type": "lanes"}), mi.load_dict({"type": "lanes", "channels": 3})
+    roughness, color = mi.load_dict({"type": "wavefront"}), mi.load_dict({"type": "wavefront", "channels": 3})
     bsdf = lambda metallic, base_color: mi.load_dict(
         {"type": "principled", "eta": eta, "metallic": metallic, "base_color": base_color, "roughness": roughness}
     )

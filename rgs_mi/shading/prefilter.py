@@ -18,7 +18,7 @@ import drjit as dr
 import numpy as np
 from scipy import fft
 
-from ..core.arrays import lanes
+from ..core.arrays import as_float
 from .tables import lobe
 
 #: Roughness of each level and the most rows of its map; None: as the environment. Level 0 is the mirror: no filter.
@@ -145,11 +145,11 @@ class _Apply(dr.CustomOp):
 
     def backward(self):
         adjoint = np.ascontiguousarray(self.grad_out().numpy().reshape(-1, 4)[:, :3])
-        self.set_grad_in("texels", lanes(self.operator.transpose(adjoint)))
+        self.set_grad_in("texels", as_float(self.operator.transpose(adjoint)))
 
     @staticmethod
     def _pad(values):
-        return lanes(np.pad(values, ((0, 0), (0, 1))))
+        return as_float(np.pad(values, ((0, 0), (0, 1))))
 
     def name(self):
         return "rgs_mi.shading.Prefilter"

@@ -6,16 +6,16 @@ import mitsuba as mi
 _R2 = (3242174889, 2447445414)  # its increments, in units of 2⁻³²
 
 
-def points(n: int, seed, lane, number, sets: int = 1):
-    """``sets`` independent ``mi.Point2f``: element ``number`` of the sequence, shifted by a random offset that is the same
-    wherever ``lane``, below ``n``, is. Each is uniform then, and those of a lane fill the square evenly.
+def points(n: int, seed, pixel, sample, sets: int = 1):
+    """``sets`` independent ``mi.Point2f``: element ``sample`` of the sequence, shifted by a random offset that is the same
+    wherever ``pixel``, below ``n``, is. Each is uniform then, and those of a pixel fill the square evenly.
 
-    ``seed``, ``lane``, ``number``: ``mi.UInt32``.
+    ``seed``, ``pixel``, ``sample``: ``mi.UInt32``.
     """
     rng = mi.PCG32(size=n, initstate=mi.UInt64(seed))
     offsets = [[rng.next_uint32() for _ in _R2] for _ in range(sets)]
     dr.eval(offsets)
-    return [mi.Point2f(*(_unit(dr.gather(mi.UInt32, o, lane) + number * g) for o, g in zip(pair, _R2))) for pair in offsets]
+    return [mi.Point2f(*(_unit(dr.gather(mi.UInt32, o, pixel) + sample * g) for o, g in zip(pair, _R2))) for pair in offsets]
 
 
 def _unit(x):

@@ -40,12 +40,12 @@ class Shader:
         differentiable in all of them and in the weights, in both modes."""
         values = [*dr.log(1 + dr.maximum(C_s, 0)), roughness, cosine, mi.Float(1)]
         n = dr.width(values)
-        lane, row = dr.arange(mi.UInt32, n), dr.opaque(mi.UInt32, n)
+        pixel, row = dr.arange(mi.UInt32, n), dr.opaque(mi.UInt32, n)
         flat = dr.empty(mi.Float, n * len(values))
         for k, value in enumerate(values):
-            dr.scatter(flat, value, lane + k * row, mode=dr.ReduceMode.Permute)
+            dr.scatter(flat, value, pixel + k * row, mode=dr.ReduceMode.Permute)
         out = self._network()(mi.TensorXf(flat, (len(values), n))).array
-        gain = mi.Color3f(*[dr.gather(mi.Float, out, lane + k * row, mode=dr.ReduceMode.Permute) for k in range(3)])
+        gain = mi.Color3f(*[dr.gather(mi.Float, out, pixel + k * row, mode=dr.ReduceMode.Permute) for k in range(3)])
         return C_s * dr.exp(_REACH * gain)
 
     def _network(self):

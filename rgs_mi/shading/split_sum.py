@@ -26,12 +26,12 @@ class SplitSum:
     eta: float = DEFAULT_ETA
     entries: "mi.Float | None" = None
 
-    def specular(self, normal, view, roughness, metallic, base_color, cover=None):
+    def specular(self, normal, view, roughness, metallic, base_color, incident_radiance=None):
         """C_s, ``mi.Color3f``: radiance that the specular lobes of surfaces, one a lane, reflect towards ``view``.
 
-        ``normal``, ``view``: unit, world space, ``view`` from the surface to the camera. ``cover(radiance, direction,
-        lane)``: what comes along ``direction`` to the surface of ``lane`` (an index, None: of the same lane) where the
-        environment would bring ``radiance`` (None: that).
+        ``normal``, ``view``: unit, world space, ``view`` from the surface to the camera. ``incident_radiance(radiance, direction,
+        index)``: callback that returns incident radiance after occlusion along ``direction`` at the surface ``index`` (None:
+        each at its own), where the unoccluded environment has ``radiance``; None means the unoccluded environment.
         """
         cosine = dr.dot(normal, view)
         reflected = 2 * cosine * normal - view
@@ -39,17 +39,17 @@ class SplitSum:
         incoming = mi.Color3f(0)
         for a, r, w in taps(cosine, roughness, phi, self.entries):
             incoming += w * self.environment.eval(dr.normalize(reflected + a * normal), r)
-        if cover is not None:
-            incoming = cover(incoming, reflected, None)
+        if incident_radiance is not None:
+            incoming = incident_radiance(incoming, reflected, None)
         return incoming * E
 
-    def diffuse(self, normal, view, roughness, metallic, base_color, cover=None, share=1):
-        """The same for the diffuse lobe, to which ``share`` of the light comes ((9) of `indirect`); ``cover`` is not asked:
-        that lobe has no one direction."""
+    def diffuse(self, normal, view, roughness, metallic, base_color, incident_radiance=None, irradiance_visibility=1):
+        """The same for the diffuse lobe, which receives the part ``irradiance_visibility`` of the light ((9) of `indirect`);
+        ``incident_radiance`` is not called, since that lobe has no one direction."""
         E = _table(dr.dot(normal, view), roughness, (3,), self.eta)[0]
-        return self.environment.eval_diffuse(normal) * share * E * (1 - metallic) * base_color
+        return self.environment.eval_diffuse(normal) * irradiance_visibility * E * (1 - metallic) * base_color
 
-    def seen_again(self) -> "SplitSum":
+    def for_secondary_bounce(self) -> "SplitSum":
         """The estimator of what a reflected ray meets."""
         return self
 

@@ -17,7 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import lanes
+from ..core.arrays import as_float
 from .tables import cell
 
 FILE = "taps.npy"
@@ -34,7 +34,7 @@ def shipped() -> np.ndarray:
 
 @functools.lru_cache(maxsize=2)
 def _entries(variant):
-    return lanes(shipped())
+    return as_float(shipped())
 
 
 def taps(cosine, roughness, phi, entries=None) -> list:

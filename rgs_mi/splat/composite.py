@@ -1,19 +1,19 @@
-"""Front-to-back compositing of surfels in one walk over the lists, and its replayed adjoint.
+"""Front-to-back compositing of surfels in one walk over the tile intersections, and its replayed adjoint.
 
-Per pixel, over its lane's surfels front to back, with T_1 = 1:
+Per pixel, over its block's surfels front to back, with T_1 = 1:
 
     α_i = o_i exp(−½ min(u² + v², LOW_PASS |δ|²)),   w_i = T_i α_i,   T_{i+1} = T_i − w_i,
     image = Σ_i w_i (features_i, t_i, 1), and where asked t_i²                                     (2)
 
-The normal among the features is n_i + u ∂n_i/∂u + v ∂n_i/∂v, what `Surfels.slopes` makes of it; where the low-pass decides,
-it is the centre's, as the depth is.
+The normal among the features is n_i + u ∂n_i/∂u + v ∂n_i/∂v, what `Surfels.normal_derivatives` makes of it;
+where the low-pass decides, it is the centre's, as the depth is.
 
 The adjoint walks the same lists again, front to back, and stores nothing per step. With g_i the inner product of the
 pixel's adjoint with surfel i's vector in (2), and rest_i = Σ_{j>i} w_j g_j,
 
     ∂L/∂w-part: w_i · adjoint      ∂L/∂α_i = T_i g_i − rest_i / (1 − α_i)                          (3)
 
-and the chain from α, t, u and v down to the ten numbers of a record is written out in `Hit.pull_back`. The tangent
+and the chain from α, t, u and v down to the ten numbers of a projected Gaussian is written out in `Hit.vjp`. The tangent
 (forward mode) walks it a third way: Ṫ_{i+1} = Ṫ_i − ẇ_i.
 """
 
@@ -24,16 +24,17 @@ import mitsuba as mi
 
 from .hit import PACKET, Hit, adding, fetch, pack, padded
 from .project import GEOMETRY
-from .tiles import Cutoffs, lane_pixels
+from .tiles import Cutoffs, block_pixels
 
 _NORMAL = 3  # the first of its three features
-_SLOPES = 6  # floats
+_DERIVATIVES = 6  # floats
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How ``features`` channels lie in a record (ten geometric numbers, the features, the normal's slopes, padded) and in a
-    pixel (features, depth, alpha, with ``squares`` also depth², padded), and the constants of the walk."""
+    """How ``features`` channels lie in a projected Gaussian's row (ten geometric numbers, the features, the normal's
+    derivatives, padded) and in a pixel (features, depth, alpha, with ``squares`` also depth², padded), and the constants of
+    the walk."""
 
     size: tuple[int, int]
     features: int
@@ -41,8 +42,8 @@ class Layout:
     squares: bool = False
 
     @property
-    def record(self):
-        return padded(len(GEOMETRY) + self.features + _SLOPES)
+    def gaussian(self):
+        return padded(len(GEOMETRY) + self.features + _DERIVATIVES)
 
     @property
     def pixel(self):
@@ -54,31 +55,31 @@ class Layout:
         return self.features + 2 + self.squares
 
 
-def _slopes(record, layout):
-    """(∂n/∂u, ∂n/∂v) of a record, a list each."""
+def _normal_derivatives(gaussian, layout):
+    """(∂n/∂u, ∂n/∂v) of a projected Gaussian, a list each."""
     end = len(GEOMETRY) + layout.features
-    return record[end : end + 3], record[end + 3 : end + _SLOPES]
+    return gaussian[end : end + 3], gaussian[end + 3 : end + _DERIVATIVES]
 
 
-def _turned(record, layout, offset):
-    """What the normal of a record changes by, ``offset`` (u, v) from its centre."""
-    return [offset[0] * a + offset[1] * b for a, b in zip(*_slopes(record, layout))]
+def _turned(gaussian, layout, offset):
+    """What the normal of a projected Gaussian changes by, ``offset`` (u, v) from its centre."""
+    return [offset[0] * a + offset[1] * b for a, b in zip(*_normal_derivatives(gaussian, layout))]
 
 
-def _features(record, layout, offset):
-    """The features of a record where a pixel meets it, ``offset`` (u, v) from its centre."""
-    values = record[len(GEOMETRY) : len(GEOMETRY) + layout.features]
-    for k, turn in enumerate(_turned(record, layout, offset), _NORMAL):
+def _features(gaussian, layout, offset):
+    """The features of a projected Gaussian where a pixel meets it, ``offset`` (u, v) from its centre."""
+    values = gaussian[len(GEOMETRY) : len(GEOMETRY) + layout.features]
+    for k, turn in enumerate(_turned(gaussian, layout, offset), _NORMAL):
         values[k] = values[k] + turn
     return values
 
 
-def _walk(lists, layout, state, body):
-    """Run ``body(surfel, pixels, T, state) -> (T, state)`` over every lane's list; T and state are lists, one a pixel of a
-    lane. Returns the final state."""
-    _, pixels = lane_pixels(layout.size)
-    centres = [(mi.Float(x) + 0.5, mi.Float(y) + 0.5) for x, y in pixels]
-    end = lists.first + lists.count
+def _walk(isects, layout, state, body):
+    """Run ``body(surfel, pixels, T, state) -> (T, state)`` over every block's list; T and state are lists, one a pixel of a
+    block. Returns the final state."""
+    _, pixels = block_pixels(layout.size)
+    centers = [(mi.Float(x) + 0.5, mi.Float(y) + 0.5) for x, y in pixels]
+    end = isects.first + isects.count
 
     def alive(i, T, state):
         greatest = T[0]
@@ -87,17 +88,17 @@ def _walk(lists, layout, state, body):
         return (i < end) & (greatest > layout.cutoffs.transmittance_min)
 
     def step(i, T, state):
-        T, state = body(dr.gather(mi.UInt32, lists.ids, i), centres, T, state)
+        T, state = body(dr.gather(mi.UInt32, isects.ids, i), centers, T, state)
         return i + 1, T, state
 
     T = [mi.Float(1) for _ in pixels]
-    return dr.while_loop((mi.UInt32(lists.first), T, state(len(pixels))), alive, step, label="splat")[2]
+    return dr.while_loop((mi.UInt32(isects.first), T, state(len(pixels))), alive, step, label="splat")[2]
 
 
 def _image_rows(layout):
-    """(row-major pixel number, inside the image?) for each pixel of a lane."""
+    """(row-major pixel number, inside the image?) for each pixel of a block."""
     width, height = layout.size
-    _, pixels = lane_pixels(layout.size)
+    _, pixels = block_pixels(layout.size)
     return [(y * width + x, (x < width) & (y < height)) for x, y in pixels]
 
 
@@ -106,7 +107,7 @@ def _gather_image(image, layout):
 
 
 def _scatter_image(values, layout):
-    """Lane order to row-major pixels: ``mi.Float`` of width H · W · layout.pixel."""
+    """Block order to row-major pixels: ``mi.Float`` of width H · W · layout.pixel."""
     width, height = layout.size
     dr.eval(values)  # otherwise every scatter below would walk the lists again
     image = dr.empty(mi.Float, width * height * layout.pixel)
@@ -118,15 +119,15 @@ def _scatter_image(values, layout):
 
 
 class Composite(dr.CustomOp):
-    """Records to image (2), with adjoint (3) and tangent."""
+    """Projected Gaussians to image (2), with adjoint (3) and tangent."""
 
-    def eval(self, record, lists, layout):
-        self.record, self.lists, self.layout = dr.detach(record), lists, layout
+    def eval(self, gaussian, isects, layout):
+        self.gaussian, self.isects, self.layout = dr.detach(gaussian), isects, layout
         n = layout.features
 
-        def body(surfel, centres, T, out):
-            r = fetch(self.record, surfel, layout.record)
-            for k, (x, y) in enumerate(centres):
+        def body(surfel, centers, T, out):
+            r = fetch(self.gaussian, surfel, layout.gaussian)
+            for k, (x, y) in enumerate(centers):
                 hit = Hit(r, x, y, layout.cutoffs)
                 w = T[k] * hit.alpha
                 features = _features(r, layout, hit.offset)
@@ -135,7 +136,7 @@ class Composite(dr.CustomOp):
                 T[k] = T[k] - w
             return T, out
 
-        out = _walk(lists, layout, lambda pixels: [[mi.Float(0)] * layout.values for _ in range(pixels)], body)
+        out = _walk(isects, layout, lambda pixels: [[mi.Float(0)] * layout.values for _ in range(pixels)], body)
         self.image = _scatter_image(out, layout)
         dr.eval(self.image)
         return self.image
@@ -146,14 +147,14 @@ class Composite(dr.CustomOp):
         image = _gather_image(self.image, layout)
         rest = [sum((a * o for a, o in zip(adj, out)), mi.Float(0)) for adj, out in zip(adjoint, image)]
         dr.eval(adjoint, rest)
-        gradient = dr.zeros(mi.Float, dr.width(self.record))
+        gradient = dr.zeros(mi.Float, dr.width(self.gaussian))
         mode = adding(dr.width(gradient))
-        stride = layout.record // PACKET
+        stride = layout.gaussian // PACKET
 
-        def body(surfel, centres, T, rest):
-            r = fetch(self.record, surfel, layout.record)
-            total = [mi.Float(0)] * layout.record
-            for k, (x, y) in enumerate(centres):
+        def body(surfel, centers, T, rest):
+            r = fetch(self.gaussian, surfel, layout.gaussian)
+            total = [mi.Float(0)] * layout.gaussian
+            for k, (x, y) in enumerate(centers):
                 hit = Hit(r, x, y, layout.cutoffs)
                 w = T[k] * hit.alpha
                 g, d_normal = adjoint[k][n + 1], [w * a for a in adjoint[k][_NORMAL : _NORMAL + 3]]
@@ -165,8 +166,8 @@ class Composite(dr.CustomOp):
                     d_t = dr.fma(2 * hit.t, adjoint[k][n + 2], d_t)
                 rest[k] = rest[k] - w * g
                 d_alpha = T[k] * g - rest[k] * dr.rcp(1 - hit.alpha)
-                d_offset = [sum((a * d for a, d in zip(slope, d_normal)), mi.Float(0)) for slope in _slopes(r, layout)]
-                local = hit.pull_back(r, d_alpha, w * d_t, d_offset)
+                d_offset = [sum((a * d for a, d in zip(v, d_normal)), mi.Float(0)) for v in _normal_derivatives(r, layout)]
+                local = hit.vjp(r, d_alpha, w * d_t, d_offset)
                 local += [w * a for a in adjoint[k][:n]] + [d * a for d in hit.offset for a in d_normal]
                 total = [t + l for t, l in zip(total, local)] + total[len(local) :]
                 T[k] = T[k] - w
@@ -180,18 +181,18 @@ class Composite(dr.CustomOp):
                 )
             return T, rest
 
-        dr.eval(_walk(self.lists, layout, lambda pixels: rest, body))
-        self.set_grad_in("record", gradient)
+        dr.eval(_walk(self.isects, layout, lambda pixels: rest, body))
+        self.set_grad_in("gaussian", gradient)
 
     def forward(self):
         layout, n = self.layout, self.layout.features
-        tangent = self.grad_in("record")
+        tangent = self.grad_in("gaussian")
 
-        def body(surfel, centres, T, state):
-            r, r_ = (fetch(b, surfel, layout.record) for b in (self.record, tangent))
-            for k, (x, y) in enumerate(centres):
+        def body(surfel, centers, T, state):
+            r, r_ = (fetch(b, surfel, layout.gaussian) for b in (self.gaussian, tangent))
+            for k, (x, y) in enumerate(centers):
                 hit = Hit(r, x, y, layout.cutoffs)
-                alpha_, t_, offset_ = hit.push_forward(r, r_)
+                alpha_, t_, offset_ = hit.jvp(r, r_)
                 T_, out_ = state[k]
                 values, values_ = (_features(b, layout, hit.offset) for b in (r, r_))
                 for c, turn_ in enumerate(_turned(r, layout, offset_), _NORMAL):
@@ -204,16 +205,16 @@ class Composite(dr.CustomOp):
             return T, state
 
         start = lambda pixels: [(mi.Float(0), [mi.Float(0)] * layout.values) for _ in range(pixels)]
-        state = _walk(self.lists, layout, start, body)
+        state = _walk(self.isects, layout, start, body)
         self.set_grad_out(_scatter_image([out_ for _, out_ in state], layout))
 
     def name(self):
         return "rgs_mi.splat.Composite"
 
 
-def composite(projected, features, lists, layout):
+def composite(projected, features, isects, layout):
     """The image of (2): ``mi.Float`` of width H · W · layout.pixel, row-major, each pixel (features, depth, alpha, perhaps
     depth², padding). ``features``: a list of ``mi.Float`` of width N, the normal's three after the first three.
-    Differentiable in the records, in both modes."""
-    slopes = [value for slope in projected.slopes for value in slope]
-    return dr.custom(Composite, pack(projected.geometry + features + slopes), lists, layout)
+    Differentiable in the projected Gaussians, in both modes."""
+    normal_derivatives = [value for derivative in projected.normal_derivatives for value in derivative]
+    return dr.custom(Composite, pack(projected.geometry + features + normal_derivatives), isects, layout)

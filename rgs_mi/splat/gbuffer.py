@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .composite import Layout, composite
-from .intersect import lane_lists
+from .intersect import isect_tiles
 from .project import project
 from .tiles import Cutoffs
 
@@ -67,10 +67,10 @@ class GBuffer:
         )
 
 
-def render_gbuffer(surfels, camera, screen_offset=None, cutoffs=Cutoffs(), full=False) -> GBuffer:
-    """Splat ``surfels`` into ``camera``; differentiable in all fields. ``screen_offset``: see `project`. ``full``: make the
+def render_gbuffer(surfels, camera, means2d_offset=None, cutoffs=Cutoffs(), full=False) -> GBuffer:
+    """Splat ``surfels`` into ``camera``; differentiable in all fields. ``means2d_offset``: see `project`. ``full``: make the
     maps that only regularisers want, too."""
-    projected = project(surfels, camera, screen_offset)
+    projected = project(surfels, camera, means2d_offset)
     delta = surfels.column(mi.Vector3f, "delta_normal")
     features = [
         *surfels.radiance(projected.view),
@@ -80,7 +80,7 @@ def render_gbuffer(surfels, camera, screen_offset=None, cutoffs=Cutoffs(), full=
         surfels.column(mi.Float, "metallic"),
         *(delta if full else ()),
     ]
-    dr.eval(projected.geometry, features, projected.slopes)
-    lists = lane_lists(projected, camera.size, cutoffs)
-    image = composite(projected, features, lists, Layout(camera.size, len(features), cutoffs, squares=full))
-    return GBuffer(camera.size, image, lists.seen, full)
+    dr.eval(projected.geometry, features, projected.normal_derivatives)
+    isects = isect_tiles(projected, camera.size, cutoffs)
+    image = composite(projected, features, isects, Layout(camera.size, len(features), cutoffs, squares=full))
+    return GBuffer(camera.size, image, isects.seen, full)

@@ -6,13 +6,13 @@ import drjit as dr
 import mitsuba as mi
 
 from .project import GEOMETRY
-from .tiles import LOW_PASS, PIXELS
+from .tiles import BLOCK, LOW_PASS
 
 PACKET = 4  # floats per gather and scatter
 HORIZON = 1e-5  # least h of (1): beyond it a ray runs along the surfel's plane, or meets it behind the camera
 _LEAST_ROWS = 1024
 _MOST_COPIED = 2**26  # floats, in all threads together
-_HALF_DIAGONAL = 0.5 * math.hypot(PIXELS[0] - 1, PIXELS[1] - 1)  # from a lane's middle to its pixels' centres
+_HALF_DIAGONAL = 0.5 * math.hypot(BLOCK[0] - 1, BLOCK[1] - 1)  # from a block's middle to its pixels' centres
 
 
 def padded(count):
@@ -48,10 +48,10 @@ def fetch(buffer, row, stride, active=True):
 
 
 class Hit:
-    """One pixel against one record: equation (1) of `project.py` and the weight of (2) of `composite.py`."""
+    """One pixel against one projected Gaussian: equation (1) of `project.py` and the weight of (2) of `composite.py`."""
 
-    def __init__(self, record, x, y, cutoffs):
-        X, Y, A_x, A_y, B_x, B_y, N_x, N_y, z, opacity = record[: len(GEOMETRY)]
+    def __init__(self, gaussian, x, y, cutoffs):
+        X, Y, A_x, A_y, B_x, B_y, N_x, N_y, z, opacity = gaussian[: len(GEOMETRY)]
         self.dx, self.dy = x - X, y - Y
         h = 1 + N_x * self.dx + N_y * self.dy
         in_front = h > HORIZON
@@ -69,9 +69,9 @@ class Hit:
         self.alpha = dr.select(self.kept, dr.minimum(alpha, cutoffs.alpha_max), 0)
         self.t = dr.select(self.on_plane, z * self.inv_h, z)
 
-    def sort_key(self, record, cutoffs):
-        """t, if this hit is in the middle of a lane's pixels, and −∞ where none of them can see the surfel."""
-        _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, opacity = record[: len(GEOMETRY)]
+    def sort_key(self, gaussian, cutoffs):
+        """t, if this hit is in the middle of a block's pixels, and −∞ where none of them can see the surfel."""
+        _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, opacity = gaussian[: len(GEOMETRY)]
         tilt = _HALF_DIAGONAL * dr.sqrt(N_x * N_x + N_y * N_y)
         turn = _HALF_DIAGONAL * dr.sqrt(A_x * A_x + A_y * A_y + B_x * B_x + B_y * B_y)
         # From the middle to a pixel, h changes by at most tilt, and (u, v) by (turn + |(u, v)| tilt) / h there
@@ -82,9 +82,9 @@ class Hit:
         nearest = dr.maximum(dr.minimum(on_plane, on_screen), 0)
         return dr.select(opacity * dr.exp(-0.5 * nearest * nearest) > cutoffs.alpha_min, self.t, -dr.inf)
 
-    def pull_back(self, record, d_alpha, d_t, d_offset):
+    def vjp(self, gaussian, d_alpha, d_t, d_offset):
         """Gradient of the ten geometric numbers, from that of α, t and the offset."""
-        _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, _ = record[: len(GEOMETRY)]
+        _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, _ = gaussian[: len(GEOMETRY)]
         d_alpha = dr.select(self.kept & ~self.clamped, d_alpha, 0)
         d_rho = -0.5 * self.alpha * d_alpha
         plane = lambda value: dr.select(self.on_plane, value, 0)
@@ -109,9 +109,9 @@ class Hit:
             d_alpha * self.gauss,
         ]
 
-    def push_forward(self, record, tangent):
-        """The tangents of α, t and the offset, from that of the record."""
-        _, _, A_x, A_y, B_x, B_y, N_x, N_y, z, _ = record[: len(GEOMETRY)]
+    def jvp(self, gaussian, tangent):
+        """The tangents of α, t and the offset, from that of the projected Gaussian."""
+        _, _, A_x, A_y, B_x, B_y, N_x, N_y, z, _ = gaussian[: len(GEOMETRY)]
         X_, Y_, A_x_, A_y_, B_x_, B_y_, N_x_, N_y_, z_, opacity_ = tangent[: len(GEOMETRY)]
         h_ = N_x_ * self.dx + N_y_ * self.dy - N_x * X_ - N_y * Y_
         u_ = (A_x_ * self.dx + A_y_ * self.dy - A_x * X_ - A_y * Y_ - self.u * h_) * self.inv_h

@@ -1,9 +1,9 @@
-"""Lists: which surfels each lane sees, front to back.
+"""Tile intersections: which surfels each block of 2 × 2 pixels sees, front to back.
 
 First by tile: bounds, then two stable radix sorts, by depth at the tile's centre and by tile. On a smooth surface, where
 surfels lie almost on one another, that is not their order elsewhere in the tile: reflections would jump from tile to tile,
-and with the view. So every lane takes from its tile's list the surfels that its own 2 × 2 pixels can see, and brings them
-into the order in which these pixels meet them, through a queue of ``window`` surfels (StopThePop, Radl et al. 2024).
+and with the view. So every block takes from its tile's list the surfels that its own 2 × 2 pixels can see, and brings them
+into the order in which these pixels meet them, through a queue of ``resort_window`` surfels (StopThePop, Radl et al. 2024).
 
 The bounds are exact. A surfel's weight exceeds the cut-off where u² + v² ≤ r² with r² = 2 ln(opacity / cut-off), which by
 (1) of `project.py` is an ellipse on the screen, or inside the disk of the low-pass. Each row of tiles is intersected with
@@ -16,16 +16,16 @@ import drjit as dr
 import mitsuba as mi
 
 from .hit import Hit, fetch, pack, padded
-from .tiles import LOW_PASS, PIXELS, TILE, lane_pixels, tile_grid
+from .tiles import BLOCK, LOW_PASS, TILE, block_pixels, tile_grid
 
 FAR = 1e6  # pixels: beyond every image
 SORT_RADIUS = 3.0  # standard deviations
 
 
 @dataclass
-class Lists:
-    """``ids``: surfel numbers, front to back for each lane (or tile); ``first`` and ``count``: each lane's range of ``ids``,
-    between which there may be gaps; ``seen``: one flag a surfel, whether any tile lists it."""
+class TileIntersections:
+    """``ids``: indices of surfels, front to back for each block (or tile); ``first`` and ``count``: each block's range of
+    ``ids``, between which there may be gaps; ``seen``: one flag a surfel, whether any tile lists it."""
 
     ids: "mi.UInt32"
     first: "mi.UInt32"
@@ -107,27 +107,27 @@ def _depth_at_tile(geometry, column, row):
     return z / dr.clip(1 + shrink * (N_x * dx + N_y * dy), 0.5, 2)
 
 
-def lane_lists(projected, size, cutoffs) -> Lists:
-    """The surfels of every lane of an image of ``size`` (width, height) pixels, lanes as `lane_pixels` numbers them."""
+def isect_tiles(projected, size, cutoffs) -> TileIntersections:
+    """The surfels of every block of an image of ``size`` (width, height) pixels, blocks as `block_pixels` numbers them."""
     with dr.suspend_grad():
-        tiles = _tile_lists(projected, size, cutoffs.alpha_min)
-        tile, pixels = lane_pixels(size)
+        tiles = _tile_intersections(projected, size, cutoffs.alpha_min)
+        tile, pixels = block_pixels(size)
         first, count = (dr.gather(mi.UInt32, values, tile) for values in (tiles.first, tiles.count))
-        end, stop = first + count, first + dr.select(count > 0, count + cutoffs.window, 0)
-        lanes = dr.width(tile) // dr.width(tiles.first)
-        start = first * lanes + count * (dr.arange(mi.UInt32, dr.width(tile)) % lanes)  # room for the whole tile's list
-        middle = [mi.Float(corner) + 0.5 * n for corner, n in zip(pixels[0], PIXELS)]
-        records = pack(projected.geometry)
-        ids = dr.empty(mi.UInt32, dr.width(tiles.ids) * lanes)
-        dr.eval(records, first, end, stop, start, middle)
+        end, stop = first + count, first + dr.select(count > 0, count + cutoffs.resort_window, 0)
+        blocks = dr.width(tile) // dr.width(tiles.first)
+        start = first * blocks + count * (dr.arange(mi.UInt32, dr.width(tile)) % blocks)  # room for the whole tile's list
+        middle = [mi.Float(corner) + 0.5 * n for corner, n in zip(pixels[0], BLOCK)]
+        gaussians = pack(projected.geometry)
+        ids = dr.empty(mi.UInt32, dr.width(tiles.ids) * blocks)
+        dr.eval(gaussians, first, end, stop, start, middle)
 
         def step(i, at, depths, surfels):
             listed = i < end
             surfel = dr.gather(mi.UInt32, tiles.ids, i, listed)
-            record = fetch(records, surfel, padded(len(projected.geometry)), listed)
+            gaussian = fetch(gaussians, surfel, padded(len(projected.geometry)), listed)
             # One surfel enters the queue, the nearest leaves it; "farther than all" drives the rest out in the end.
-            depth = dr.select(listed, Hit(record, *middle, cutoffs).sort_key(record, cutoffs), dr.inf)
-            for k in reversed(range(cutoffs.window)):
+            depth = dr.select(listed, Hit(gaussian, *middle, cutoffs).sort_key(gaussian, cutoffs), dr.inf)
+            for k in reversed(range(cutoffs.resort_window)):
                 nearer = depth < depths[k]
                 depth, depths[k] = dr.minimum(depth, depths[k]), dr.maximum(depth, depths[k])
                 surfel, surfels[k] = dr.select(nearer, surfel, surfels[k]), dr.select(nearer, surfels[k], surfel)
@@ -135,14 +135,14 @@ def lane_lists(projected, size, cutoffs) -> Lists:
             dr.scatter(ids, surfel, at, leaves)
             return i + 1, at + dr.select(leaves, mi.UInt32(1), 0), depths, surfels
 
-        empty = [mi.Float(-dr.inf)] * cutoffs.window, [mi.UInt32(0)] * cutoffs.window
+        empty = [mi.Float(-dr.inf)] * cutoffs.resort_window, [mi.UInt32(0)] * cutoffs.resort_window
         past = dr.while_loop((first, start, *empty), lambda i, at, depths, surfels: i < stop, step, label="sort")[1]
         count = past - start
         dr.eval(ids, count)
-        return Lists(ids, start, count, tiles.seen)
+        return TileIntersections(ids, start, count, tiles.seen)
 
 
-def _tile_lists(projected, size, alpha_min) -> Lists:
+def _tile_intersections(projected, size, alpha_min) -> TileIntersections:
     """The surfels of every tile, sorted by `_depth_at_tile`. Call it where gradients are suspended."""
     columns, rows = tile_grid(size)
     outline, drawn = _outline(projected.geometry, alpha_min)
@@ -174,23 +174,23 @@ def _tile_lists(projected, size, alpha_min) -> Lists:
     n_tiles = columns * rows
     seen = entries > 0
     if total == 0:
-        return Lists(dr.zeros(mi.UInt32, 1), dr.zeros(mi.UInt32, n_tiles), dr.zeros(mi.UInt32, n_tiles), seen)
+        return TileIntersections(dr.zeros(mi.UInt32, 1), dr.zeros(mi.UInt32, n_tiles), dr.zeros(mi.UInt32, n_tiles), seen)
     tile, surfel, depth = dr.empty(mi.UInt32, total), dr.empty(mi.UInt32, total), dr.empty(mi.Float, total)
-    number = dr.arange(mi.UInt32, dr.width(entries))
+    surfels = dr.arange(mi.UInt32, dr.width(entries))
 
-    def place(row, at):
+    def emit(row, at):
         first, last = span(row)
 
         def put(column, at):
             dr.scatter(tile, mi.UInt32(row) * columns + column, at)
-            dr.scatter(surfel, number, at)
+            dr.scatter(surfel, surfels, at)
             dr.scatter(depth, _depth_at_tile(projected.geometry, column, row), at)
             return column + 1, at + 1
 
         _, at = dr.while_loop((first, at), lambda column, at: column < last, put)
         return row + 1, at
 
-    dr.eval(dr.while_loop((mi.Int32(top), mi.UInt32(offset)), lambda row, at: row < bottom, place))
+    dr.eval(dr.while_loop((mi.Int32(top), mi.UInt32(offset)), lambda row, at: row < bottom, emit))
     length = dr.zeros(mi.UInt32, n_tiles)
     dr.scatter_reduce(dr.ReduceOp.Add, length, mi.UInt32(1), tile)
     first = dr.prefix_reduce(dr.ReduceOp.Add, length, exclusive=True)
@@ -198,4 +198,4 @@ def _tile_lists(projected, size, alpha_min) -> Lists:
     order = dr.gather(mi.UInt32, near, dr.argsort(dr.gather(mi.UInt32, tile, near)))  # stable: by tile, then by depth
     ids = dr.gather(mi.UInt32, surfel, order)
     dr.eval(ids, first, length, seen)
-    return Lists(ids, first, length, seen)
+    return TileIntersections(ids, first, length, seen)

@@ -1,4 +1,4 @@
-"""From surfels to screen-space records.
+"""From surfels to projected Gaussians.
 
 Let p be a surfel's centre in camera space, z its depth, n its normal, a = t_u/s_u and b = t_v/s_v, and δ a pixel's
 offset from the projected centre. The pixel's ray meets the surfel's plane at
@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-#: Names of the ten geometric numbers of a record.
+#: Names of the ten geometric numbers of a projected Gaussian.
 GEOMETRY = ("x", "y", "A_x", "A_y", "B_x", "B_y", "N_x", "N_y", "z", "opacity")
 NEAR = 1e-2  # surfels closer than this (scene units) are not drawn
 EDGE_ON = 1e-3  # least |cosine| between a surfel's normal and the ray to its centre that (1) divides by
@@ -24,13 +24,13 @@ EDGE_ON = 1e-3  # least |cosine| between a surfel's normal and the ray to its ce
 @dataclass
 class Projected:
     """``geometry``: the ten numbers of (1), ``mi.Float`` of width N each; ``view``: unit directions from the camera to the
-    centres, world space; ``normal``: unit normals turned towards the camera, world space, and ``slopes``: how they change
-    with u and v; ``visible``: in front of the camera, and turned to it where surfels are one-sided."""
+    centres, world space; ``normal``: unit normals turned towards the camera, world space, and ``normal_derivatives``:
+    how they change with u and v; ``visible``: in front of the camera, and turned to it where surfels are one-sided."""
 
     geometry: list
     view: "mi.Vector3f"
     normal: "mi.Vector3f"
-    slopes: tuple
+    normal_derivatives: tuple
     visible: "mi.Bool"
 
 
@@ -46,10 +46,10 @@ def opaque(camera):
     )
 
 
-def project(surfels, camera, screen_offset=None) -> Projected:
+def project(surfels, camera, means2d_offset=None) -> Projected:
     """Project all surfels into ``camera``; differentiable.
 
-    ``screen_offset``: optional ``mi.Vector2f`` (pixels, width N) added to the projected centres. Give zeros with gradients
+    ``means2d_offset``: optional ``mi.Vector2f`` (pixels, width N) added to the projected centres. Give zeros with gradients
     enabled to obtain the image-plane gradient that density control accumulates.
     """
     R, origin, f, principal = opaque(camera)
@@ -63,8 +63,8 @@ def project(surfels, camera, screen_offset=None) -> Projected:
     z = dr.select(visible, p.z, 1)
     x = p.x / z * f.x + principal.x
     y = p.y / z * f.y + principal.y
-    if screen_offset is not None:
-        x, y = x + screen_offset.x, y + screen_offset.y
+    if means2d_offset is not None:
+        x, y = x + means2d_offset.x, y + means2d_offset.y
 
     distance = dr.norm(offset)
     facing = dr.dot(p, n)
@@ -81,6 +81,6 @@ def project(surfels, camera, screen_offset=None) -> Projected:
         [x, y, A.x, A.y, B.x, B.y, N.x, N.y, z, opacity],
         offset / distance,
         turned(n_world),
-        tuple(map(turned, surfels.slopes())),
+        tuple(map(turned, surfels.normal_derivatives())),
         visible,
     )

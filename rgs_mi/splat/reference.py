@@ -10,7 +10,7 @@ import numpy as np
 
 from .gbuffer import Maps
 from .project import NEAR
-from .tiles import LOW_PASS, PIXELS, Cutoffs
+from .tiles import BLOCK, LOW_PASS, Cutoffs
 
 
 def _front_to_back(surfels, camera) -> np.ndarray:
@@ -18,23 +18,23 @@ def _front_to_back(surfels, camera) -> np.ndarray:
     pixel's PIXELS block meets them."""
     width, height = camera.size
     fields = {name: value.astype(np.float64) for name, value in surfels.numpy().items()}
-    centre = (fields["centers"] - camera.origin) @ camera.rotation.T
-    front = np.flatnonzero(centre[:, 2] > NEAR)
-    centre, scales = centre[front], fields["scales"][front]
+    center = (fields["centers"] - camera.origin) @ camera.rotation.T
+    front = np.flatnonzero(center[:, 2] > NEAR)
+    center, scales = center[front], fields["scales"][front]
     t_u, t_v, normal = (v.numpy().T[front].astype(np.float64) @ camera.rotation.T for v in surfels.frames())
-    projected = centre[:, :2] / centre[:, 2:] * camera.focal + camera.principal
+    projected = center[:, :2] / center[:, 2:] * camera.focal + camera.principal
 
-    blocks = [np.arange(0, n, block) + block / 2 for n, block in zip(camera.size, PIXELS)]
+    blocks = [np.arange(0, n, block) + block / 2 for n, block in zip(camera.size, BLOCK)]
     middle = np.stack(np.meshgrid(*blocks), -1)[:, :, None]  # [rows, columns, 1, 2]
     ray = np.concatenate([(middle - camera.principal) / camera.focal, np.ones((*middle.shape[:3], 1))], -1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        t = (centre * normal).sum(-1) / (ray * normal).sum(-1)  # [rows, columns, N]
-        offset = t[..., None] * ray - centre
+        t = (center * normal).sum(-1) / (ray * normal).sum(-1)  # [rows, columns, N]
+        offset = t[..., None] * ray - center
         on_plane = ((offset * t_u).sum(-1) / scales[:, 0]) ** 2 + ((offset * t_v).sum(-1) / scales[:, 1]) ** 2
     on_screen = LOW_PASS * ((middle - projected) ** 2).sum(-1)
-    depth = np.where((t > 0) & (on_plane <= on_screen), t, centre[:, 2])
+    depth = np.where((t > 0) & (on_plane <= on_screen), t, center[:, 2])
     order = front[np.argsort(depth, axis=-1, kind="stable")]
-    return order.repeat(PIXELS[1], 0).repeat(PIXELS[0], 1)[:height, :width].reshape(width * height, -1).astype(np.uint32)
+    return order.repeat(BLOCK[1], 0).repeat(BLOCK[0], 1)[:height, :width].reshape(width * height, -1).astype(np.uint32)
 
 
 def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> Maps:
@@ -54,12 +54,12 @@ def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> Maps:
     d = mi.Vector3f(np.ascontiguousarray(camera.rays().reshape(-1, 3).T.astype(np.float32)))  # camera-space z is 1
     d = dr.gather(mi.Vector3f, d, pixel)
     t_u, t_v, normal = (dr.gather(mi.Vector3f, v, surfel) for v in surfels.frames())
-    centre, z = dr.gather(mi.Point3f, centers, surfel) - origin, dr.gather(mi.Float, depth, surfel)
+    center, z = dr.gather(mi.Point3f, centers, surfel) - origin, dr.gather(mi.Float, depth, surfel)
     scales = of(mi.Vector2f, "scales")
-    facing = dr.dot(centre, normal)
+    facing = dr.dot(center, normal)
     t = facing / dr.dot(d, normal)
-    u, v = dr.dot(t * d - centre, t_u) / scales.x, dr.dot(t * d - centre, t_v) / scales.y
-    projected = mi.Vector2f(dr.dot(centre, x_axis) * camera.focal[0], dr.dot(centre, y_axis) * camera.focal[1]) / z
+    u, v = dr.dot(t * d - center, t_u) / scales.x, dr.dot(t * d - center, t_v) / scales.y
+    projected = mi.Vector2f(dr.dot(center, x_axis) * camera.focal[0], dr.dot(center, y_axis) * camera.focal[1]) / z
     offset = mi.Vector2f(mi.Float(pixel % width) + 0.5, mi.Float(pixel // width) + 0.5) - mi.Vector2f(camera.principal)
     on_plane = dr.select(t > 0, u * u + v * v, dr.largest(mi.Float))
     on_screen = LOW_PASS * dr.squared_norm(offset - projected)

@@ -44,7 +44,7 @@ class Proxies:
         with dr.suspend_grad():
             opacity = surfels.column(mi.Float, "opacities")
             if box is not None:
-                opacity = dr.select(box.holds(surfels.column(mi.Point3f, "centers")), opacity, 0)
+                opacity = dr.select(box.contains(surfels.column(mi.Point3f, "centers")), opacity, 0)
             self.extent = dr.sqrt(2 * dr.log(dr.maximum(opacity / solid, 1)))
             positions, faces = quads(corners(surfels, self.extent))
             self.normal = surfels.frames()[2]
@@ -59,18 +59,18 @@ class Proxies:
             self.scene = mi.load_dict({"type": "scene", "proxies": mesh})
         self.two_sided = surfels.two_sided
 
-    def meet(self, origin, normal, direction, active=True):
-        """(found, number, place): whether the ray of an ``active`` lane meets the front of a surfel, which, and where on it
+    def intersect(self, origin, normal, direction, active=True):
+        """(found, index, uv): whether the ray of an ``active`` lane meets the front of a surfel, which, and where on it
         (see `Surfels.normals`). ``normal``: of the surface that the rays leave."""
         with dr.suspend_grad():
             ray = mi.Ray3f(mi.Point3f(origin + self.clearance * normal), mi.Vector3f(direction))
             hit = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
-            found, number = hit.is_valid(), hit.prim_index // 2
+            found, index = hit.is_valid(), hit.prim_index // 2
             if not self.two_sided:
-                found &= dr.dot(dr.gather(mi.Vector3f, self.normal, number, found), ray.d) < 0
-            place = dr.gather(mi.Float, self.extent, number, found) * mi.Point2f(*self.position(hit))
-            dr.eval(found, number, place)
-            return found, number, place
+                found &= dr.dot(dr.gather(mi.Vector3f, self.normal, index, found), ray.d) < 0
+            uv = dr.gather(mi.Float, self.extent, index, found) * mi.Point2f(*self.position(hit))
+            dr.eval(found, index, uv)
+            return found, index, uv
 
     @staticmethod
     def position(hit):

@@ -2,7 +2,7 @@
 
 A ray crosses the quads of `Proxies` front to back. With α_i = o_i exp(−(u² + v²)/2) where it crosses surfel i,
 
-    w_i = α_i Π_{j<i} (1 − α_j),   A = Σ w_i,   x̄ = Σ w_i x_i / A                                        (8)
+    w_i = α_i Π_{j<i} (1 − α_j),   A = Σ w_i,   x̄ = Σ w_i x_i / A                                       (10)
 
 are weights, coverage, and the means of distance, normal (n + u ∂n/∂u + v ∂n/∂v) and material: a G-buffer's
 (`splat/composite.py`), in the exact order of the ray and without the low-pass of pixels. The ray ends on the surfels with
@@ -28,9 +28,9 @@ _SHAPE, _MATERIAL = 12, 8  # floats in a row
 
 
 @dataclass
-class Met:
+class SurfelIntersection:
     """Where rays end on surfels, a lane each. ``found``: whether they do; ``t``: mean distance; ``normal``: unit mean of
-    n + Δn, world space; ``roughness``, ``metallic``, ``base_color``: means; ``number``: the surfel whose radiance they
+    n + Δn, world space; ``roughness``, ``metallic``, ``base_color``: means; ``index``: the surfel whose radiance they
     bring."""
 
     found: "mi.Bool"
@@ -39,10 +39,10 @@ class Met:
     roughness: "mi.Float"
     metallic: "mi.Float"
     base_color: "mi.Color3f"
-    number: "mi.UInt32"
+    index: "mi.UInt32"
 
 
-class SurfelRays:
+class SurfelRayTracer:
     """``surfels`` as rays meet them, those in the ``box`` where there is one; not differentiated. Its functions may be
     called within symbolic loops."""
 
@@ -55,7 +55,7 @@ class SurfelRays:
                     column(mi.Float, "opacities"),
                     self.proxies.extent,
                     *self.proxies.normal,
-                    *(value for slope in surfels.slopes() for value in slope),
+                    *(value for slope in surfels.normal_derivatives() for value in slope),
                 ]
             )
             self.material = pack(
@@ -72,21 +72,21 @@ class SurfelRays:
         self.two_sided = surfels.two_sided
 
     @dr.syntax
-    def meet(self, ray, reach, leaves, sample, active) -> Met:
-        """(8) along each ``ray`` up to the distance ``reach``. ``leaves``: whether the ray comes from surfels (see
+    def intersect(self, ray, maxt, leaves, sample, active) -> SurfelIntersection:
+        """(10) along each ``ray`` up to the distance ``maxt``. ``leaves``: whether the ray comes from surfels (see
         `_cross`); ``sample``: uniform random numbers that decide who is found."""
         active, found = mi.Bool(active), mi.Bool(False)
         passed, remaining = mi.Float(0), mi.Float(1)
-        number, last = mi.UInt32(0), mi.UInt32(_NONE)
+        index, last = mi.UInt32(0), mi.UInt32(_NONE)
         t, normal = mi.Float(0), mi.Vector3f(0)
         roughness, metallic, base_color = mi.Float(0), mi.Float(0), mi.Color3f(0)
         while active:
-            active, distance, i, alpha, facing = self._cross(ray, passed, reach, leaves, last, active)
+            active, distance, i, alpha, facing = self._cross(ray, passed, maxt, leaves, last, active)
             weight = remaining * alpha
             remaining -= weight
             goes_on = remaining > _CUTOFFS.transmittance_min
             picked = ~found & ((1 - remaining > sample) | ~goes_on)
-            number = dr.select(picked, i, number)
+            index = dr.select(picked, i, index)
             found |= picked
             row = fetch(self.material, i, _MATERIAL, active & (alpha > 0))
             t += weight * distance
@@ -98,33 +98,33 @@ class SurfelRays:
             active &= goes_on
         mean = dr.rcp(dr.maximum(1 - remaining, _CUTOFFS.alpha_min))
         length = dr.norm(normal)
-        return Met(
+        return SurfelIntersection(
             found & (length > 0),
             t * mean,
             normal / dr.select(length > 0, length, 1),
             roughness * mean,
             metallic * mean,
             base_color * mean,
-            number,
+            index,
         )
 
     @dr.syntax
-    def transmittance(self, ray, reach, leaves, active):
-        """Π (1 − α_i) along each ``ray`` up to the distance ``reach``, ``mi.Float``; see `meet`."""
+    def transmittance(self, ray, maxt, leaves, active):
+        """Π (1 − α_i) along each ``ray`` up to the distance ``maxt``, ``mi.Float``; see `intersect`."""
         active = mi.Bool(active)
         passed, remaining, last = mi.Float(0), mi.Float(1), mi.UInt32(_NONE)
         while active:
-            active, distance, last, alpha, _ = self._cross(ray, passed, reach, leaves, last, active)
+            active, distance, last, alpha, _ = self._cross(ray, passed, maxt, leaves, last, active)
             remaining *= 1 - alpha
             passed = self._past(ray, distance)
             active &= remaining > _CUTOFFS.transmittance_min
         return dr.select(remaining > _CUTOFFS.transmittance_min, remaining, 0)
 
-    def radiance(self, number, direction, active):
-        """Diffuse radiance that surfel ``number`` itself sends against ``direction``; see `Surfels.radiance`."""
+    def radiance(self, index, direction, active):
+        """Diffuse radiance that surfel ``index`` itself sends against ``direction``; see `Surfels.radiance`."""
         value = mi.Color3f(0.5)
         for k, Y in enumerate(dr.sh_eval(direction, sh_order(self.channels))):
-            at = number * self.channels + 3 * k
+            at = index * self.channels + 3 * k
             value += Y * mi.Color3f(*(dr.gather(mi.Float, self.sh, at + c, active) for c in range(3)))
         return dr.maximum(value, 0)
 
@@ -132,27 +132,27 @@ class SurfelRays:
         """Where rays that leave surfels at ``point`` start: above their neighbours."""
         return point + self.proxies.clearance * normal
 
-    def _cross(self, ray, passed, reach, leaves, last, active):
+    def _cross(self, ray, passed, maxt, leaves, last, active):
         """(whether there is a next crossing beyond the distance ``passed``, its distance, the surfel's number, α, and its
         normal turned against the ray); α is 0 where the surfel does not show, or is the ``last`` one again.
 
         A ray that ``leaves`` surfels is not stopped by the backs of others near its start: these are of the same surface,
         which is as thick as surfels lie unevenly."""
         onward = mi.Ray3f(ray.o + passed * ray.d, ray.d)
-        onward.maxt = reach - passed
+        onward.maxt = maxt - passed
         hit = self.proxies.scene.ray_intersect_preliminary(onward, coherent=False, active=active)
-        met, number = active & hit.is_valid(), hit.prim_index // 2
-        distance = passed + dr.select(met, hit.t, 0)
-        opacity, extent, *vectors = fetch(self.shape, number, _SHAPE, met)[:11]
-        normal, slope_u, slope_v = (mi.Vector3f(*vectors[k : k + 3]) for k in (0, 3, 6))
+        valid, index = active & hit.is_valid(), hit.prim_index // 2
+        distance = passed + dr.select(valid, hit.t, 0)
+        opacity, extent, *vectors = fetch(self.shape, index, _SHAPE, valid)[:11]
+        normal, dn_du, dn_dv = (mi.Vector3f(*vectors[k : k + 3]) for k in (0, 3, 6))
         u, v = (extent * value for value in self.proxies.position(hit))
         alpha = opacity * dr.exp(-0.5 * (u * u + v * v))
         away = dr.dot(normal, ray.d) > 0
-        shows = met & (alpha > _CUTOFFS.alpha_min) & (number != last)
+        shows = valid & (alpha > _CUTOFFS.alpha_min) & (index != last)
         shows &= ~(away & (leaves & (distance < self.thickness))) if self.two_sided else ~away
         alpha = dr.select(shows, dr.minimum(alpha, _CUTOFFS.alpha_max), 0)
-        normal += u * slope_u + v * slope_v
-        return met, distance, number, alpha, dr.select(away, -normal, normal)
+        normal += u * dn_du + v * dn_dv
+        return valid, distance, index, alpha, dr.select(away, -normal, normal)
 
     def _past(self, ray, distance):
         return distance + _STEP * (dr.max(dr.abs(ray.o)) + distance)

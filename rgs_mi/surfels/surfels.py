@@ -37,7 +37,7 @@ class Surfels:
     sh            diffuse radiance, linear: max(0, 1/2 + sum_k sh_k Y_k(d)), d from the camera to the centre (3DGS)
     base_color, roughness, metallic   principled BSDF parameters in [0, 1]
     delta_normal  the residual Δn that is added to the normal (RGS, eq. of N)
-    curvature     K_uu, K_uv, K_vv: how the normal turns across the surfel, radians per √(s_u s_v); see `slopes`
+    curvature     K_uu, K_uv, K_vv: how the normal turns across the surfel, radians per √(s_u s_v); see `normal_derivatives`
     two_sided     whether surfels show from behind, with the normal turned to the camera (2DGS); one-sided ones, whose
                   normals point outwards, keep the far side of a closed object from bending its silhouette's normals
     """
@@ -82,14 +82,14 @@ class Surfels:
         index = dr.arange(mi.UInt32, len(self)) * tensor.shape[1] + k
         return dr.gather(mi.Float, tensor.array, index, mode=dr.ReduceMode.NoConflicts)
 
-    def take(self, number) -> "Surfels":
-        """The surfels ``number`` (``mi.UInt32``, repeats allowed)."""
+    def take(self, index) -> "Surfels":
+        """The surfels ``index`` (``mi.UInt32``, repeats allowed)."""
 
         def rows(tensor):
-            count, channels = dr.width(number), tensor.shape[1]
-            lane = dr.arange(mi.UInt32, count * channels)
-            index = dr.gather(mi.UInt32, number, lane // channels) * channels + lane % channels
-            return mi.TensorXf(dr.gather(mi.Float, tensor.array, index, mode=dr.ReduceMode.Local), (count, channels))
+            count, channels = dr.width(index), tensor.shape[1]
+            entry = dr.arange(mi.UInt32, count * channels)
+            source = dr.gather(mi.UInt32, index, entry // channels) * channels + entry % channels
+            return mi.TensorXf(dr.gather(mi.Float, tensor.array, source, mode=dr.ReduceMode.Local), (count, channels))
 
         return Surfels(*(rows(getattr(self, name)) for name in CHANNELS), self.two_sided)
 
@@ -101,7 +101,7 @@ class Surfels:
         n = mi.Vector3f(2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y))
         return t_u, t_v, n
 
-    def slopes(self):
+    def normal_derivatives(self):
         """(∂n/∂u, ∂n/∂v), each ``mi.Vector3f`` of width N: u and v standard deviations from the centre the normal is
         n + u ∂n/∂u + v ∂n/∂v, as on a surface whose curvature tensor is K / √(s_u s_v). The surfel itself stays flat.
 
@@ -112,13 +112,13 @@ class Surfels:
         ratio = dr.sqrt(scales.x / scales.y)
         return ratio * (K.x * t_u + K.y * t_v), (K.y * t_u + K.z * t_v) / ratio
 
-    def normals(self, place=None):
-        """Unit normals n + Δn in world space, ``mi.Vector3f`` of width N, in the middle of the surfels; with ``place``
+    def normals(self, uv=None):
+        """Unit normals n + Δn in world space, ``mi.Vector3f`` of width N, in the middle of the surfels; with ``uv``
         (``mi.Point2f``: u, v in standard deviations from there) as turned as they are there."""
         normal = self.frames()[2] + self.column(mi.Vector3f, "delta_normal")
-        if place is not None:
-            slope_u, slope_v = self.slopes()
-            normal = normal + place.x * slope_u + place.y * slope_v
+        if uv is not None:
+            dn_du, dn_dv = self.normal_derivatives()
+            normal = normal + uv.x * dn_du + uv.y * dn_dv
         return dr.normalize(normal)
 
     def radiance(self, direction):

@@ -33,7 +33,7 @@ DIELECTRICS = ((0.0, 0.0, 0.0), (0.8, 0.8, 0.8), (0.1, 0.3, 0.7))  # without a d
 ENVIRONMENTS = ("studio", "kitchen", "city")
 BOUNDS = {"metal": 0.02, "dielectric": 0.03}  # of split_sum's error on a sphere
 BATCHES = 16
-_ENVIRONMENT_ROWS = 256
+_ENVIRONMENT_HEIGHT = 256
 _DEEP = 8
 
 
@@ -89,11 +89,11 @@ def grid(shapes=("sphere",), environments=ENVIRONMENTS, roughness=ROUGHNESS) -> 
 
 @dataclass
 class Result:
-    """What came out for a case, [pixels, 3] each, for the pixels ``lanes`` [pixels] that see the shape."""
+    """What came out for a case, [pixels, 3] each, for the pixels ``pixels`` [pixels] that see the shape."""
 
     case: Case
     size: tuple[int, int]
-    lanes: np.ndarray
+    pixels: np.ndarray
     path: Estimate
     deep: Estimate
     monte_carlo: Estimate
@@ -146,7 +146,7 @@ class Result:
         """[H, W, 3] of values [pixels, 3], zero where the shape is not."""
         width, height = self.size
         image = np.zeros((height * width, 3), np.float32)
-        image[self.lanes] = values
+        image[self.pixels] = values
         return image.reshape(height, width, 3)
 
 
@@ -164,12 +164,12 @@ class Validator:
         light = {
             "type": "procedural_envmap",
             "name": case.environment,
-            "resolution": _ENVIRONMENT_ROWS,
+            "height": _ENVIRONMENT_HEIGHT,
             "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90),
         }
         scene = mi.load_dict({"type": "scene", "light": light} | _shapes(case))
-        si, lanes, rays = self._hits(scene)
-        n = len(lanes)
+        si, pixels, rays = self._hits(scene)
+        n = len(pixels)
         view, normal = si.to_world(si.wi), mi.Vector3f(si.sh_frame.n)
         surfaces = (
             normal,
@@ -178,24 +178,24 @@ class Validator:
             dr.opaque(mi.Float, case.metallic, n),
             mi.Color3f(*(dr.opaque(mi.Float, c, n) for c in case.base_color)),
         )
-        cover = None if case.shape == "sphere" else _Visibility(scene, si)
+        incident_radiance = None if case.shape == "sphere" else _Visibility(scene, si)
         environment = Environment.from_emitter(scene.environment())
 
         def sampled(seed):
             estimator = MonteCarlo(
                 environment.unfiltered(), scene.environment(), DEFAULT_ETA, 2 * self.samples, dr.opaque(mi.UInt32, seed)
             )
-            return _radiance(estimator, case, surfaces, cover)
+            return _radiance(estimator, case, surfaces, incident_radiance)
 
         batches = range(self.seed + 1, self.seed + 1 + BATCHES)
         return Result(
             case,
             self.size,
-            lanes,
+            pixels,
             Estimate.of([self._path(scene, rays, 2, k) for k in batches]),
             Estimate.of([self._path(scene, rays, _DEEP, BATCHES + k) for k in batches]),
             Estimate.of([sampled(k) for k in batches]),
-            _radiance(SplitSum(environment.filtered(), DEFAULT_ETA), case, surfaces, cover),
+            _radiance(SplitSum(environment.filtered(), DEFAULT_ETA), case, surfaces, incident_radiance),
         )
 
     def _hits(self, scene):
@@ -204,11 +204,11 @@ class Validator:
         directions = mi.Vector3f(camera.rays().reshape(-1, 3).T.astype(np.float32))
         rays = mi.Ray3f(mi.Point3f(*camera.origin.tolist()), dr.normalize(directions))
         si = scene.ray_intersect(rays)
-        lanes = dr.compress(si.is_valid() & (dr.dot(si.sh_frame.n, rays.d) < 0))
-        rays = mi.Ray3f(rays.o, dr.gather(mi.Vector3f, rays.d, lanes))
+        pixels = dr.compress(si.is_valid() & (dr.dot(si.sh_frame.n, rays.d) < 0))
+        rays = mi.Ray3f(rays.o, dr.gather(mi.Vector3f, rays.d, pixels))
         si = scene.ray_intersect(rays)
         dr.eval(si, rays)
-        return si, lanes.numpy(), rays
+        return si, pixels.numpy(), rays
 
     def _path(self, scene, rays, depth, seed):
         """[pixels, 3] radiance along ``rays`` as Mitsuba's `path` sees it."""
@@ -227,8 +227,8 @@ class _Visibility:
     def __init__(self, scene, si):
         self.scene, self.si = scene, si
 
-    def __call__(self, light, direction, lane):
-        si = self.si if lane is None else dr.gather(mi.SurfaceInteraction3f, self.si, lane)
+    def __call__(self, light, direction, index):
+        si = self.si if index is None else dr.gather(mi.SurfaceInteraction3f, self.si, index)
         return dr.select(self.scene.ray_test(si.spawn_ray(direction)), 0, light)
 
 
@@ -249,10 +249,10 @@ def _shapes(case):
     }
 
 
-def _radiance(estimator, case, surfaces, cover):
+def _radiance(estimator, case, surfaces, incident_radiance):
     """[pixels, 3] what ``estimator`` gives for ``surfaces``."""
     with dr.suspend_grad():
-        radiance = estimator.specular(*surfaces, cover)
+        radiance = estimator.specular(*surfaces, incident_radiance)
         if case.lit:
-            radiance += estimator.diffuse(*surfaces, cover)
+            radiance += estimator.diffuse(*surfaces, incident_radiance)
         return radiance.numpy().T

@@ -81,17 +81,17 @@ def _furnace(roughness, metallic, color, samples):
 def _chi2(roughness) -> float:
     """p-value of the lobe's sampler against its density, for a view at 60°."""
 
-    def lanes(n):
+    def wavefront(n):
         lobe = SpecularLobe(mi.Float(roughness), mi.Float(1), mi.Color3f(1), DEFAULT_ETA)
         return lobe, interaction(mi.Vector3f(0.75**0.5, 0, 0.5) + dr.zeros(mi.Vector3f, n))
 
     def draw(points):
-        lobe, si = lanes(dr.width(points))
+        lobe, si = wavefront(dr.width(points))
         local = lobe.sample(si, mi.Float(0.5), points)
         return local, dr.select(local.z > 0, mi.Float(1), 0)  # below the horizon nothing is reflected
 
     def density(local):
-        lobe, si = lanes(dr.width(local))
+        lobe, si = wavefront(dr.width(local))
         return lobe.pdf(si, local)
 
     test = mi.chi2.ChiSquareTest(

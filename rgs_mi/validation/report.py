@@ -58,7 +58,7 @@ def _row(r) -> dict:
         "environment": c.environment,
         "material": c.material,
         "roughness": f"{c.roughness:g}",
-        "pixels": len(r.lanes),
+        "pixels": len(r.pixels),
         "z_passed": f"{r.difference.passed:.4f}",
         "z_of_sums": f"{r.difference.global_z:.2f}",
         "split_sum_error": f"{r.error:.4f}",

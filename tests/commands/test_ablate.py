@@ -22,7 +22,7 @@ from rgs_mi.settings.settings import Settings
 
 from runs import PATIENCE, ROOT, TARGET, make_suite, start, start_script, wait_for
 
-SMALL = ["iterations=6", "start.surfels=200", "stages=[{views: 2}]", "density.interval=3", "density.start=0"]
+SMALL = ["iterations=6", "initialization.surfels=200", "stages=[{views: 2}]", "density.refine_every=3", "density.start=0"]
 
 
 @pytest.fixture(scope="module")
@@ -194,7 +194,7 @@ def test_stopped_and_gone_on(suite, tmp_path, monkeypatch):
         tmp_path / "out",
         "--quiet",
         "--set",
-        "start.surfels=200",
+        "initialization.surfels=200",
         "--set",
         "stages=[{views: 2}]",
         "--set",

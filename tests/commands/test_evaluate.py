@@ -12,7 +12,7 @@ from rgs_mi.core.errors import UserError
 from rgs_mi.evaluation import lpips
 from rgs_mi.evaluation.evaluate import SCORES
 
-SMALL = ["iterations=20", "start.surfels=300", "stages=[{views: 2}]", "indirect_start=0"]
+SMALL = ["iterations=20", "initialization.surfels=300", "stages=[{views: 2}]", "indirect_start=0"]
 QUALITY = ("psnr", "ssim", "normal_mae_deg", "normal_ssim")
 
 

@@ -51,7 +51,8 @@ def test_files(run):
     maps = mi.Bitmap(str(run / "test" / "r_0_gbuffer.exr"))
     names = [field.name for field in maps.struct_()]
     normal, alpha = (
-        np.array(maps)[..., [names.index(n) for n in pick]] for pick in (["normal.X", "normal.Y", "normal.Z"], ["alpha.Y"])
+        np.array(maps)[..., [names.index(n) for n in pick]]
+        for pick in (["sh_normal.X", "sh_normal.Y", "sh_normal.Z"], ["alpha.Y"])
     )
     np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), alpha[..., 0], atol=1e-4)
     assert not [p for p in run.rglob("*.tmp")]
@@ -120,10 +121,10 @@ def test_photographs_without_masks(inputs, tmp_path):
             for setting in [
                 *SMALL,
                 "iterations=30",
-                "density.interval=10",
+                "density.refine_every=10",
                 "density.start=0",
                 "sh_start=0.2",
-                "start.surroundings=100",
+                "initialization.surroundings=100",
             ]
             for word in ("--set", setting)
         ),
@@ -233,7 +234,7 @@ def test_interrupt(inputs, tmp_path):
         "--set",
         "iterations=1000000",
         "--set",
-        "start.surfels=300",
+        "initialization.surfels=300",
         "--set",
         "checkpoint_seconds=0",
     )

@@ -14,7 +14,7 @@ import pytest
 
 from runs import make_inputs, start_script
 
-OPTIONS = ["--quiet", "--set", "iterations=300", "--set", "start.surfels=2000", "--set", "checkpoint_seconds=0.3"]
+OPTIONS = ["--quiet", "--set", "iterations=300", "--set", "initialization.surfels=2000", "--set", "checkpoint_seconds=0.3"]
 TOLERANCE = 0.2  # dB: sums of floats differ from run to run
 
 

@@ -17,7 +17,7 @@ from rgs_mi.report import comparison, published, results
 from captures import photographs, write_colmap, write_nerfstudio, write_nero
 from runs import PATIENCE, make_suite, start_script, wait_for
 
-SMALL = ["iterations=6", "start.surfels=200", "stages=[{views: 2}]", "density.stop=0"]
+SMALL = ["iterations=6", "initialization.surfels=200", "stages=[{views: 2}]", "density.stop=0"]
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +160,7 @@ def test_stopped_and_gone_on(captures, tmp_path, monkeypatch):
         "--workers",
         "2",
         "--set",
-        "start.surfels=200",
+        "initialization.surfels=200",
         "--set",
         "stages=[{views: 2}]",
         "--set",

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from rgs_mi.core.bounding_box import Box
+from rgs_mi.core.bounding_box import BoundingBox
 from rgs_mi.datasets.types import Dataset, View
 from rgs_mi.fit.density import Gradients, densify
 from rgs_mi.fit.model import Model
@@ -19,7 +19,7 @@ from rgs_mi.surfels.surfels import CHANNELS
 
 from scenes import orbit_camera, sphere_surfels
 
-BOX = Box((-2.0, -2.0, -2.0), (2.0, 0.0, 2.0))  # half of the unit sphere
+BOX = BoundingBox((-2.0, -2.0, -2.0), (2.0, 0.0, 2.0))  # half of the unit sphere
 
 
 def cameras(count=8, distance=4.0):
@@ -34,20 +34,20 @@ def photographs():
 
 
 def test_found_from_cameras():
-    box = Box.seen_by(cameras())
-    inside = lambda p: (np.array(box.lower) < p).all() and (p < np.array(box.upper)).all()
+    box = BoundingBox.seen_by(cameras())
+    inside = lambda p: (np.array(box.min) < p).all() and (p < np.array(box.max)).all()
     assert inside(np.zeros(3)) and 1.5 < box.radius < 2.5
     assert not any(inside(camera.origin) for camera in cameras())
-    np.testing.assert_allclose(box.centre, 0, atol=0.15)
-    larger = Box.seen_by(cameras(distance=8.0))
+    np.testing.assert_allclose(box.center, 0, atol=0.15)
+    larger = BoundingBox.seen_by(cameras(distance=8.0))
     assert larger.radius == pytest.approx(2 * box.radius, rel=0.1)
 
 
 @pytest.mark.parametrize("numbers", [(0, 0, 0, 1, 1), (0, 0, 0, 1, 0, 1), (0, 0, 0, 1, 1, float("inf"))])
 def test_six_numbers(numbers):
     with pytest.raises(ValueError, match="a box is six numbers"):
-        Box.of(numbers)
-    assert Box.of(map(float, str(BOX).split())) == BOX
+        BoundingBox.of(numbers)
+    assert BoundingBox.of(map(float, str(BOX).split())) == BOX
 
 
 @pytest.mark.parametrize("lit", [False, True])
@@ -55,7 +55,7 @@ def test_only_what_is_in_the_box_reflects(lit):
     surfels, camera = sphere_surfels(800, scale=1.0), orbit_camera(0.3)
     environment = Environment(mi.TensorXf(np.random.default_rng(0).random((8, 16, 3), np.float32)), np.eye(3)).filtered()
     shade = lambda box: deferred.render(surfels, camera, deferred.Lighting(SplitSum(environment), lit=lit, box=box))
-    whole, half, none = (np.array(shade(box).color).T for box in (None, BOX, Box((5.0,) * 3, (6.0,) * 3)))
+    whole, half, none = (np.array(shade(box).color).T for box in (None, BOX, BoundingBox((5.0,) * 3, (6.0,) * 3)))
     own = np.array(deferred.render(surfels, camera, None).color).T
     np.testing.assert_array_equal(none, own)
     maps = deferred.render(surfels, camera, None).gbuffer.all
@@ -74,13 +74,13 @@ def test_rays_meet_what_is_in_the_box():
     centers = surfels.numpy()["centers"]
     target = centers[rng.integers(200, size=2000)]
     direction = -target
-    met = {}
+    hit = {}
     for box in (BOX, None):
         rays = mi.Point3f((3 * target).T), mi.Vector3f(0), mi.Vector3f(direction.T)
-        found, number, _ = Proxies(surfels, box=box).meet(*rays)
-        met[box] = centers[number.numpy()[found.numpy()], 1]
-        assert len(met[box]) > 500
-    assert (met[BOX] <= 0).all() and (met[None] > 0).mean() > 0.3
+        found, number, _ = Proxies(surfels, box=box).intersect(*rays)
+        hit[box] = centers[number.numpy()[found.numpy()], 1]
+        assert len(hit[box]) > 500
+    assert (hit[BOX] <= 0).all() and (hit[None] > 0).mean() > 0.3
 
 
 def test_in_scenes():

@@ -202,8 +202,8 @@ def test_pixels_that_no_photograph_shows(tmp_path):
         for view in load_dataset(tmp_path).train:
             assert not view.masked and view.alpha.all() and min(view.camera.size) > 25
             assert (view.camera.size == SIZE) == whole and view.pixels.shape[1::-1] == view.camera.size
-            centre = view.camera.rays()[int(view.camera.principal[1] - 0.5), int(view.camera.principal[0] - 0.5)]
-            np.testing.assert_allclose(centre, view.camera.to_world[:3, 2], atol=0.02)
+            center = view.camera.rays()[int(view.camera.principal[1] - 0.5), int(view.camera.principal[0] - 0.5)]
+            np.testing.assert_allclose(center, view.camera.to_world[:3, 2], atol=0.02)
         for name, pixels in photographs(k1=k1).items():
             save(tmp_path / f"masks/{name}.png", np.full(pixels.shape[:2], 255, np.uint8))
         save(tmp_path / "masks/v00.png", np.pad(np.zeros((2, 2), np.uint8), ((0, 94), (0, 118)), constant_values=255))

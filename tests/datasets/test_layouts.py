@@ -21,7 +21,13 @@ from captures import (
     write_nero,
 )
 
-FEW = ["iterations=30", "start.surfels=300", "start.surroundings=600", "stages=[{views: 2}]", "indirect_start=0"]
+FEW = [
+    "iterations=30",
+    "initialization.surfels=300",
+    "initialization.surroundings=600",
+    "stages=[{views: 2}]",
+    "indirect_start=0",
+]
 
 
 def nero_with_masks(folder):
@@ -61,7 +67,7 @@ def test_fit(inputs, tmp_path, monkeypatch, layout):
         assert scene.integrator().box is None and np.linalg.norm(centers, axis=1).max() < 12
     else:
         box = scene.integrator().box
-        assert all((np.array(box.lower) < p).all() and (p < box.upper).all() for p in POINTS)
+        assert all((np.array(box.min) < p).all() and (p < box.max).all() for p in POINTS)
         assert np.linalg.norm(centers, axis=1).max() > 20
     assert (folder / "report.html").stat().st_size > 10_000
     assert np.isfinite(np.array(mi.render(scene, sensor=0))).all()

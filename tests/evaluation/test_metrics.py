@@ -79,7 +79,7 @@ def scored():
     truth[0] = 0
     pixels = np.dstack([rng.integers(256, size=(32, 40, 3)), 255 * alpha]).astype(np.uint8)
     view = SimpleNamespace(pixels=pixels, alpha=alpha, normal=truth)
-    return view, evaluate.Rendering(display(pixels, 1.0), alpha[..., None].copy(), {"normal": normal * alpha[..., None]})
+    return view, evaluate.Rendering(display(pixels, 1.0), alpha[..., None].copy(), {"sh_normal": normal * alpha[..., None]})
 
 
 def test_scores(scored, monkeypatch):
@@ -92,7 +92,7 @@ def test_scores(scored, monkeypatch):
     assert figures["psnr"] == np.inf and figures["ssim"] == figures["normal_ssim"] == pytest.approx(1)
     assert figures["lpips"] == figures["lpips_alex"] == 0
     assert figures["normal_lpips"] == pytest.approx(0, abs=1e-6)  # the first row is white in both
-    rendering.maps["normal"][5, 5] *= -1
+    rendering.maps["sh_normal"][5, 5] *= -1
     rendering.image[5, 5] = 1 - rendering.image[5, 5]
     figures = evaluate.score(view, rendering, 1.0)
     assert figures["lpips"] > 0.01 and figures["normal_lpips"] > 0.01 and figures["normal_ssim"] < 0.999

@@ -13,13 +13,19 @@ from rgs_mi.core.errors import UserError
 from rgs_mi.core.scene_files import load_scene
 from rgs_mi.datasets import load_dataset
 from rgs_mi.evaluation import metrics
-from rgs_mi.evaluation.evaluate import photograph
+from rgs_mi.evaluation.evaluate import ground_truth
 from rgs_mi.export.relight import edit, relight
 from rgs_mi.export.render import render_scene, sensor_dict, straight
 
 from runs import TARGET, make_inputs
 
-SETTINGS = ["iterations=150", "start.surfels=800", "stages=[{views: 2}]", "density.stop=0", "rates.environment=[0.1,0.03]"]
+SETTINGS = [
+    "iterations=150",
+    "initialization.surfels=800",
+    "stages=[{views: 2}]",
+    "density.stop=0",
+    "learning_rates.environment=[0.1,0.03]",
+]
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +82,7 @@ def test_light_in_a_stock_scene_reproduces_the_photographs(run, inputs):
         for view in views[:4]:
             color = straight(np.array(mi.render(scene, sensor=mi.load_dict(sensor_dict(view.camera)), spp=64)))
             image = color[..., :3] * color[..., 3:] + 1 - color[..., 3:]
-            errors.append(metrics.psnr(image, photograph(view, 1.0)))
+            errors.append(metrics.psnr(image, ground_truth(view, 1.0)))
         return np.mean(errors)
 
     right = psnr(exported)

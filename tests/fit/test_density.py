@@ -88,14 +88,14 @@ def test_halves_have_the_normals_that_a_curved_surfel_had_there():
     t_u, t_v, _ = (v.numpy().T[3] for v in m.surfels(0).frames())
     tensors = lambda: m.surfels(0).curvature.numpy() / np.sqrt(m.surfels(0).scales.numpy().prod(1, keepdims=True))
     tensor = tensors()[3]
-    centre, residual = m.numpy("centers")[3], m.numpy("delta_normal")[3]
+    center, residual = m.numpy("centers")[3], m.numpy("delta_normal")[3]
     hot = np.zeros(N)
     hot[3] = 1.0
     densify(m, gradients(hot), 1.0, Density(), np.random.default_rng(0), 1000)
     assert len(m) == N + 1
     assert tensors()[[3, N]] == pytest.approx(np.tile(tensor, (2, 1)), rel=1e-4)
     for half in (3, N):
-        away = m.numpy("centers")[half] - centre
+        away = m.numpy("centers")[half] - center
         x, y = away @ t_u, away @ t_v
         assert np.hypot(x, y) > 0.01
         turned = (tensor[0] * x + tensor[1] * y) * t_u + (tensor[1] * x + tensor[2] * y) * t_v

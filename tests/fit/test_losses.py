@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from rgs_mi.core.arrays import lanes as aligned
+from rgs_mi.core.arrays import as_float as aligned
 from rgs_mi.core.camera import Camera
 from rgs_mi.core.color import srgb_encode
 from rgs_mi.fit import losses
@@ -118,7 +118,7 @@ def test_normal_smoothness_equals_numpy(crease):
     assert losses.normal_smoothness(gbuffer, smooth, crease)[0] == pytest.approx(expected, rel=1e-4)
 
 
-def test_fairness_equals_numpy():
+def test_minimum_variation_equals_numpy():
     """Value and gradient, on a cylinder that wobbles, with an edge."""
     width, height, apart, rng = 120, 50, 2, np.random.default_rng(5)
     angle = np.linspace(0, 0.8, width) + 0.7 * (np.arange(width) > 75) + rng.normal(0, 0.01, (height, width))
@@ -141,13 +141,13 @@ def test_fairness_equals_numpy():
     maps = aligned(image)
     dr.enable_grad(maps)
     gbuffer = GBuffer((width, height), maps, seen=None)
-    value = losses.fairness(gbuffer, reflective, corner=(1, 0))
+    value = losses.minimum_variation(gbuffer, reflective, corner=(1, 0))
     dr.backward(value)
     assert value[0] == pytest.approx(twin(image), rel=1e-4)
     along = rng.normal(size=image.shape)
     change = (twin(image + 1e-6 * along) - twin(image - 1e-6 * along)) / 2e-6
     assert (dr.grad(maps).numpy() * along.ravel()).sum() == pytest.approx(change, rel=1e-3)
-    assert losses.fairness(gbuffer, np.zeros_like(reflective))[0] == 0
+    assert losses.minimum_variation(gbuffer, np.zeros_like(reflective))[0] == 0
 
 
 def test_distortion_is_the_sum_over_pairs():
@@ -248,7 +248,7 @@ def test_pearson_depth_compiles_once():
     assert len(history) > 5 and all(k["cache_hit"] for k in history)
 
 
-def light_variation_twin(x):
+def environment_total_variation_twin(x):
     """Derivatives of log radiance ``x`` [rows, columns, 3] on the sphere, one after another."""
     rows, columns, _ = x.shape
     polar, azimuthal = np.pi / (rows - 1), 2 * np.pi / columns
@@ -264,23 +264,27 @@ def light_variation_twin(x):
     return total * polar * azimuthal / (4 * np.pi)
 
 
-def test_light_variation_and_its_gradient():
+def test_environment_total_variation_and_its_gradient():
     x = np.random.default_rng(5).normal(size=(5, 8, 3))
     leaf = mi.TensorXf(x.astype(np.float32))
     dr.enable_grad(leaf)
-    value = losses.light_variation(leaf)
-    assert value[0] == pytest.approx(light_variation_twin(x), rel=1e-5)
+    value = losses.environment_total_variation(leaf)
+    assert value[0] == pytest.approx(environment_total_variation_twin(x), rel=1e-5)
     dr.backward(value)
     direction = np.random.default_rng(6).normal(size=x.shape)
-    expected = (light_variation_twin(x + 1e-5 * direction) - light_variation_twin(x - 1e-5 * direction)) / 2e-5
+    expected = (
+        environment_total_variation_twin(x + 1e-5 * direction) - environment_total_variation_twin(x - 1e-5 * direction)
+    ) / 2e-5
     assert (dr.grad(leaf).numpy() * direction).sum() == pytest.approx(expected, rel=1e-4)
 
 
-def test_light_variation_does_not_depend_on_resolution():
+def test_environment_total_variation_does_not_depend_on_resolution():
     def waves(rows):
         theta, phi = np.meshgrid(np.linspace(0, np.pi, rows), (np.arange(2 * rows) + 0.5) / rows * np.pi, indexing="ij")
         value = 20 * np.sin(theta) * np.cos(phi)
-        return losses.light_variation(mi.TensorXf(np.repeat(value[..., None], 3, -1).astype(np.float32)))[0]
+        return losses.environment_total_variation(mi.TensorXf(np.repeat(value[..., None], 3, -1).astype(np.float32)))[0]
 
     assert waves(128) == pytest.approx(waves(256), rel=1e-2)
-    assert losses.light_variation(mi.TensorXf(np.full((16, 32, 3), 7.0, np.float32)))[0] == pytest.approx(0, abs=1e-5)
+    assert losses.environment_total_variation(mi.TensorXf(np.full((16, 32, 3), 7.0, np.float32)))[0] == pytest.approx(
+        0, abs=1e-5
+    )

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from rgs_mi.commands.optimize import start
-from rgs_mi.core.arrays import lanes
+from rgs_mi.core.arrays import as_float
 from rgs_mi.datasets.photographs import Photographs
 from rgs_mi.datasets.types import DepthPrior
 from rgs_mi.fit import losses
 from rgs_mi.fit import trainer as fit_module
 from rgs_mi.fit.density import Gradients
 from rgs_mi.fit.trainer import Fit
-from rgs_mi.settings.settings import Density, Rates, Settings, Stage, Start, Weights
+from rgs_mi.settings.settings import Density, Initialization, LearningRates, Settings, Stage, Weights
 from rgs_mi.shading import deferred
 from rgs_mi.shading.deferred import Shading
 from rgs_mi.shading.environment import Environment
@@ -73,7 +73,9 @@ def test_a_fit_gets_better(dataset):
 def test_a_wrong_depth_prior_bends_the_surface(dataset):
     """A plane as the prior and a great weight: the rendered depth takes its slope."""
     rows = np.broadcast_to(np.arange(75, dtype=np.float32)[:, None], (75, 83))
-    settings = replace(SETTINGS, weights=Weights(dssim=0, mask=0, normal=0, depth=10), rates=Rates(centers=(5e-3, 5e-3)))
+    settings = replace(
+        SETTINGS, weights=Weights(dssim=0, mask=0, normal=0, depth=10), learning_rates=LearningRates(centers=(5e-3, 5e-3))
+    )
     correlation = {}
     for sign in (1, -1):
         fit = Fit(dataset, model(), settings, 1.0, priors=[DepthPrior(sign * rows)] * 6)
@@ -115,7 +117,7 @@ def test_guided_surfels_need_half_the_gradient(dataset):
     """What is reflective covers the object here, so all surfels are guided, and more of them pass the threshold."""
     grown = {}
     for guided in (False, True):
-        density = Density(start=0.0, stop=1.0, interval=20, threshold=2e-3, guided=guided, max_surfels=10_000)
+        density = Density(start=0.0, stop=1.0, refine_every=20, grow_grad2d=2e-3, guided=guided, max_surfels=10_000)
         fit = Fit(dataset, model(), replace(SETTINGS, iterations=21, density=density), 1.0)
         while fit.progress < 1:
             fit.step()
@@ -150,7 +152,7 @@ def test_distortion_draws_surfels_together(dataset):
     spread = {}
     for weight in (0.0, 1000.0):  # as 2DGS has it
         weights = Weights(dssim=0, mask=0, normal=0, distortion=weight)
-        settings = replace(SETTINGS, weights=weights, rates=Rates(centers=(5e-3, 5e-3)))  # far in few steps
+        settings = replace(SETTINGS, weights=weights, learning_rates=LearningRates(centers=(5e-3, 5e-3)))  # far in few steps
         fit = Fit(dataset, model(), settings, 1.0)
         fit.model.set("centers", fit.model.numpy("centers") * np.linspace(0.9, 1.1, 3)[np.arange(300) % 3, None])
         while fit.progress < 1:
@@ -184,7 +186,7 @@ def test_no_kernel_is_compiled_after_warm_up(dataset, indirect, diffuse, monkeyp
         history = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
     assert len(history) > 100 and (len(set(hits)) > 5) == (indirect != "none")
     assert min(hits[-8:], default=2) > 1  # a single ray takes other kernels
-    assert (fit.share is not None) == (diffuse == "lit")
+    assert (fit.irradiance_visibility is not None) == (diffuse == "lit")
     assert [k["hash"] for k in history if not k["cache_hit"] or k["cache_disk"]] == []  # nor read from earlier sessions
 
 
@@ -254,7 +256,7 @@ def test_rates_fall_to_zero_in_the_end(dataset, cooldown, parts):
 
 
 def test_a_light_that_is_given_keeps_its_rows(dataset):
-    given = replace(SETTINGS, refine_start=0.0, rates=Rates(environment=(0.0, 0.0)))
+    given = replace(SETTINGS, refine_start=0.0, learning_rates=LearningRates(environment=(0.0, 0.0)))
     fit = Fit(dataset, model(), given, 1.0, Shading("split_sum"))
     fit.step()
     np.testing.assert_array_equal(fit.model.numpy("log_environment"), model().numpy("log_environment"))
@@ -294,7 +296,7 @@ def test_a_finer_environment_goes_on_with_the_moments_that_it_would_have():
         gradient = dr.grad(logarithm).numpy()
         t, m, v, _ = learned.optimizer.state["log_environment"][3]
         seen.append((gradient, m.numpy().reshape(gradient.shape), v.numpy().reshape(gradient.shape), int(np.ravel(t)[0])))
-        learned._set_moments("log_environment", mi.UInt32(7), lanes(gradient), lanes(gradient**2))
+        learned._set_moments("log_environment", mi.UInt32(7), as_float(gradient), as_float(gradient**2))
         learned.refine_environment()
     (_, _, _, before), (gradient, m, v, after) = seen
     inner = slice(4, -4)  # no lookups near the poles
@@ -308,10 +310,10 @@ def test_opacities_to_start_with(dataset, where, opacity):
     points = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
     data = replace(dataset, points=points if where == "points" else None)
     scene = SimpleNamespace(shading=Shading(), environment=model().environment())
-    settings = replace(SETTINGS, start=Start(surfels=50, hull=where == "hull"), weights=Weights(depth=0))
+    settings = replace(SETTINGS, initialization=Initialization(surfels=50, hull=where == "hull"), weights=Weights(depth=0))
     surfels = start(scene, data, settings).model.surfels(0)
     np.testing.assert_allclose(surfels.opacities.numpy(), opacity, rtol=1e-5)
-    settings = replace(settings, start=replace(settings.start, opacity=0.4))
+    settings = replace(settings, initialization=replace(settings.initialization, opacity=0.4))
     np.testing.assert_allclose(start(scene, data, settings).model.surfels(0).opacities.numpy(), 0.4, rtol=1e-5)
 
 

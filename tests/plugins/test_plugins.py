@@ -12,12 +12,12 @@ from rgs_mi.surfels.surfels import CHANNELS, SH_0, Surfels, rotation_from_normal
 
 from scenes import orbit_camera, sphere_surfels
 
-ALL_AOVS = "depth,normal,albedo,roughness,metallic,alpha,specular,diffuse"
+ALL_AOVS = "depth,sh_normal,albedo,roughness,metallic,alpha,specular,diffuse"
 AOV_CHANNELS = [
     "depth.T",
-    "normal.X",
-    "normal.Y",
-    "normal.Z",
+    "sh_normal.X",
+    "sh_normal.Y",
+    "sh_normal.Z",
     "albedo.R",
     "albedo.G",
     "albedo.B",
@@ -39,7 +39,7 @@ XML = """<scene version="3.0.0">
     <bsdf type="principled" id="material"><float name="specular" value="0.4"/></bsdf>
   </shape>
   <emitter type="procedural_envmap" id="environment">
-    <string name="name" value="constant"/> <float name="radiance" value="0.25"/> <integer name="rows" value="8"/>
+    <string name="name" value="constant"/> <float name="radiance" value="0.25"/> <integer name="height" value="8"/>
     <transform name="to_world"><rotate x="1" angle="90"/></transform>
   </emitter>
   <sensor type="perspective">
@@ -174,11 +174,11 @@ def test_photographs_are_kept(tmp_path):
 
 
 def test_constant_map_to_start_from():
-    emitter = mi.load_dict({"type": "procedural_envmap", "name": "constant", "radiance": 0.3, "rows": 10})
+    emitter = mi.load_dict({"type": "procedural_envmap", "name": "constant", "radiance": 0.3, "height": 10})
     data = mi.traverse(emitter)["data"].numpy()
     assert data.shape == (10, 22, 3) and np.allclose(data, 0.3)
     with pytest.raises(RuntimeError, match="rows is 1"):
-        mi.load_dict({"type": "procedural_envmap", "name": "constant", "rows": 1})
+        mi.load_dict({"type": "procedural_envmap", "name": "constant", "height": 1})
 
 
 def test_variants(ply):
@@ -325,6 +325,16 @@ def test_aovs_are_named_channels_of_the_exr(tmp_path):
     assert np.allclose(np.array(bitmap, np.float32)[..., order], image, rtol=2e-3, atol=1e-3)  # half precision at worst
     layers = dict(bitmap.split())
     assert set(layers) == {"<root>", *ALL_AOVS.split(",")}
+
+
+def test_aovs_have_names_of_their_own():
+    scene = load(sphere_surfels(40), integrator={"aovs": "dd:depth, nn:sh_normal,alpha"})
+    assert scene.integrator().aov_names() == ["dd.T", "nn.X", "nn.Y", "nn.Z", "alpha.Y"]
+    named, plain = (mi.render(load(sphere_surfels(40), integrator={"aovs": aovs})).numpy() for aovs in ("a:depth", "depth"))
+    np.testing.assert_array_equal(named, plain)
+    for aovs, message in (("a:depth,a:alpha", "two aovs are called 'a'"), ("a:", "unknown aov ''")):
+        with pytest.raises(RuntimeError, match=message):
+            load(sphere_surfels(40), integrator={"aovs": aovs})
 
 
 def test_one_sided_surfels_vanish_from_behind():

@@ -21,7 +21,7 @@ BATCHES = 8
 # ---- Crossings ----
 
 
-def brute_force(surfels, origin, direction, reach, leaves):
+def brute_force(surfels, origin, direction, maxt, leaves):
     """(8) of `rays.py` for each ray: (A, t, unit normal, roughness, weights [rays, N] in the order of the surfels)."""
     s = {name: value.astype(np.float64) for name, value in surfels.numpy().items()}
     t_u, t_v, normal = (np.array(v, np.float64).T for v in surfels.frames())
@@ -40,7 +40,7 @@ def brute_force(surfels, origin, direction, reach, leaves):
         spared = (cosine > 0) & ((t < thickness) if surfels.two_sided else True) & (leaves or not surfels.two_sided)
         remaining = 1.0
         for i in np.argsort(t):
-            if 0 < t[i] < reach and alpha[i] > cut.alpha_min and not spared[i] and remaining > cut.transmittance_min:
+            if 0 < t[i] < maxt and alpha[i] > cut.alpha_min and not spared[i] and remaining > cut.transmittance_min:
                 weights[r, i] = w = remaining * alpha[i]
                 remaining -= w
         facing = np.where((cosine > 0)[:, None], -bent, bent) + s["delta_normal"]
@@ -52,21 +52,21 @@ def brute_force(surfels, origin, direction, reach, leaves):
 
 
 @pytest.mark.parametrize(
-    "two_sided, leaves, reach", [(True, False, 10), (False, False, 10), (True, True, 10), (True, False, 1.5)]
+    "two_sided, leaves, maxt", [(True, False, 10), (False, False, 10), (True, True, 10), (True, False, 1.5)]
 )
-def test_rays_meet_what_brute_force_says(two_sided, leaves, reach):
+def test_rays_meet_what_brute_force_says(two_sided, leaves, maxt):
     rng = np.random.default_rng(0)
     surfels = replace(sphere_surfels(150, scale=0.5), two_sided=two_sided)
     origin = 1.2 * rng.normal(size=(600, 3))
     direction = 0.4 * rng.normal(size=(600, 3)) - origin
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     sample = rng.random(600)
-    met = ray_tracing.SurfelRays(surfels)
+    hit = ray_tracing.SurfelRayTracer(surfels)
     ray = mi.Ray3f(mi.Point3f(origin.T), mi.Vector3f(direction.T))
-    mine = met.meet(ray, mi.Float(reach), mi.Bool(leaves), mi.Float(sample), mi.Bool(True))
-    coverage, t, normal, roughness, weights = brute_force(surfels, origin, direction, reach, leaves)
+    mine = hit.intersect(ray, mi.Float(maxt), mi.Bool(leaves), mi.Float(sample), mi.Bool(True))
+    coverage, t, normal, roughness, weights = brute_force(surfels, origin, direction, maxt, leaves)
     near = lambda a, b: np.mean(np.abs(a - b) < 1e-3)  # a few rays lie within rounding of a cutoff
-    transmittance = met.transmittance(ray, mi.Float(reach), mi.Bool(leaves), mi.Bool(True)).numpy()
+    transmittance = hit.transmittance(ray, mi.Float(maxt), mi.Bool(leaves), mi.Bool(True)).numpy()
     through = np.where(1 - coverage[:, 0] > ray_tracing._CUTOFFS.transmittance_min, 1 - coverage[:, 0], 0)
     assert near(transmittance, through) > 0.99
     found = mine.found.numpy()
@@ -77,7 +77,7 @@ def test_rays_meet_what_brute_force_says(two_sided, leaves, reach):
         assert near(value[found], expected[found]) > 0.99
     # the surfel whose share the sample falls into, front to back
     order = np.argsort(((surfels.numpy()["centers"][None] - origin[:, None]) * direction[:, None]).sum(-1), 1)
-    share = weights[np.arange(600), mine.number.numpy()]
+    share = weights[np.arange(600), mine.index.numpy()]
     assert order.shape == weights.shape and (share[found] > 0).mean() > 0.99
 
 
@@ -87,9 +87,9 @@ def test_surfels_are_found_as_often_as_they_weigh():
     direction = np.array([[0, 1.0, 0]])
     ray = mi.Ray3f(mi.Point3f(*origin[0].tolist()), mi.Vector3f(*direction[0].tolist()))
     sample = mi.Float((np.arange(n) + 0.5) / n)
-    met = ray_tracing.SurfelRays(surfels).meet(ray, mi.Float(10), mi.Bool(False), sample, mi.Bool(True))
+    hit = ray_tracing.SurfelRayTracer(surfels).intersect(ray, mi.Float(10), mi.Bool(False), sample, mi.Bool(True))
     *_, weights = brute_force(surfels, origin, direction, 10, False)
-    counted = np.bincount(met.number.numpy()[met.found.numpy()], minlength=40) / n
+    counted = np.bincount(hit.index.numpy()[hit.found.numpy()], minlength=40) / n
     assert (weights > 0.02).sum() > 3
     np.testing.assert_allclose(counted, weights[0], atol=0.011)  # what is left of the transmittance goes to the last
 

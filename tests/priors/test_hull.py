@@ -28,9 +28,9 @@ def around(target=CENTRE, distance=2.5, fov=40, size=SIZE):
     return [Camera.look_at(target + distance * o, target, (0, 0, 1), fov, (size, size)) for o in d]
 
 
-def hits(camera, centre=CENTRE, radius=RADIUS):
+def hits(camera, center=CENTRE, radius=RADIUS):
     """[H, W] z-depth of a sphere, NaN beside it."""
-    rays, offset = camera.rays(), camera.origin - centre
+    rays, offset = camera.rays(), camera.origin - center
     a, b, c = (rays**2).sum(-1), rays @ offset, offset @ offset - radius**2
     with np.errstate(invalid="ignore"):
         return (-b - np.sqrt(b * b - a * c)) / a
@@ -86,7 +86,7 @@ def test_box_of_an_object_off_the_origin(data):
 
 
 def test_box_where_cameras_do_not_look_at_the_object():
-    lower, upper = hull.object_box(views_of(around(distance=4), centre=CENTRE + [0.5, 0.3, -0.4]))
+    lower, upper = hull.object_box(views_of(around(distance=4), center=CENTRE + [0.5, 0.3, -0.4]))
     np.testing.assert_allclose((lower + upper) / 2, CENTRE + [0.5, 0.3, -0.4], atol=0.1)
 
 
@@ -137,21 +137,21 @@ def test_coarse_to_fine_skips_nothing(data):
 @pytest.mark.parametrize("size", [32, 100])
 @pytest.mark.parametrize("count, peak", [(8, 1.12), (16, 1.06), (30, 1.03)])  # cones of few views leave peaks
 @pytest.mark.parametrize("centre", [(0, 0, 0), (400, -300, 250)])
-def test_object_that_fills_the_frame(size, count, peak, centre):
+def test_object_that_fills_the_frame(size, count, peak, center):
     """As `rgs_mi.datasets.path_traced` photographs objects: space that no frame shows is carved all the same."""
-    centre, distance = np.array(centre, float), path_traced.MARGIN / np.sin(np.radians(path_traced.FOV / 2))
+    center, distance = np.array(center, float), path_traced.MARGIN / np.sin(np.radians(path_traced.FOV / 2))
     views = views_of(
         [
-            Camera.look_at(centre + distance * d, centre, (0, 0, 1), path_traced.FOV, (size, size))
+            Camera.look_at(center + distance * d, center, (0, 0, 1), path_traced.FOV, (size, size))
             for d in path_traced.train_directions(count)
         ],
-        centre=centre,
+        center=center,
         radius=1,
     )
     lower, upper = hull.object_box(views)
-    assert (lower < centre - 0.95).all() and (upper > centre + 0.95).all() and (upper - lower).max() < 2.5
+    assert (lower < center - 0.95).all() and (upper > center + 0.95).all() and (upper - lower).max() < 2.5
     vertices, _, _ = hull.surface(hull.visual_hull(views, 80))
-    radius = np.linalg.norm(vertices - centre, axis=1)
+    radius = np.linalg.norm(vertices - center, axis=1)
     assert radius.min() > 0.98 and np.median(radius) < 1.02 and radius.max() < peak
 
 
@@ -220,7 +220,7 @@ def test_no_masks_and_no_common_volume(data):
     bare = [View(v.name, v.camera, v.pixels, False, None, v.path) for v in data.train]
     with pytest.raises(UserError, match="needs alpha masks in two views or more.*random points"):
         hull.visual_hull(bare)
-    apart = views_of(around()[:6]) + views_of(around()[6:12], centre=CENTRE + [0.7, 0, 0], radius=0.1)
+    apart = views_of(around()[:6]) + views_of(around()[6:12], center=CENTRE + [0.7, 0, 0], radius=0.1)
     with pytest.raises(UserError, match="no common volume|hull is empty"):
         hull.visual_hull(apart)
 

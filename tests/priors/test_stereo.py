@@ -21,10 +21,10 @@ def texture(contrast, seed=0):
     return mi.Bitmap(np.float32(np.clip(0.5 + contrast * noise / noise.std(), 0, 1)).repeat(3, 2))
 
 
-def panel(centre, u, v, contrast, seed):
+def panel(center, u, v, contrast, seed):
     """A rectangle that shines with a `texture`, to the side of u × v."""
     matrix = np.eye(4)
-    matrix[:3] = np.stack([u, v, np.cross(u, v) / np.linalg.norm(np.cross(u, v)), centre], 1)
+    matrix[:3] = np.stack([u, v, np.cross(u, v) / np.linalg.norm(np.cross(u, v)), center], 1)
     return {
         "type": "rectangle",
         "to_world": mi.ScalarTransform4f(matrix.tolist()),

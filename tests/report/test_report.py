@@ -26,7 +26,7 @@ from scenes import orbit_camera
 FIGURES = ("surfels", "render_fps", "train_seconds", "iterations", "peak_rss_mb")
 SMALL = [
     "iterations=12",
-    "start.surfels=300",
+    "initialization.surfels=300",
     "checkpoint_seconds=0",
     "stages=[{until: 0.5, downscale: 2}, {views: 2}]",
     "minutes=null",
@@ -164,7 +164,7 @@ def test_curves_of_a_run(run):
     rows = [dict(zip(lines[0].split(","), line.split(","))) for line in lines[1:]]
     assert [int(row["step"]) for row in rows] == list(range(1, 13))
     assert [row["pixels"] for row in rows] == ["16"] * 6 + ["32"] * 6
-    assert {"loss.photometric", "loss.mask", "loss.consistency", "loss.normal", "loss.fairness"} <= set(rows[0])
+    assert {"loss.photometric", "loss.mask", "loss.consistency", "loss.normal", "loss.minimum_variation"} <= set(rows[0])
     assert all(float(row["ms"]) > 0 and float(row["psnr"]) > 0 and int(row["surfels"]) > 0 for row in rows)
     assert float(rows[-1]["seconds"]) == pytest.approx(metrics(run)["train_seconds"])
 
@@ -225,7 +225,7 @@ def test_normal_error_has_the_angle():
     maps = {
         name: np.zeros((20, 20, 1 if name in ("roughness", "metallic", "depth") else 3))
         for name in ("color", "diffuse", "specular", "base_color", "roughness", "metallic", "depth")
-    } | {"normal": normal}
+    } | {"sh_normal": normal}
     shown = panels(view, Rendering(np.ones((20, 20, 3)), np.ones((20, 20, 1)), maps), 1.0)["normal error"]
     assert (shown[:5] == 255).all()
     nearest = np.abs(shown[5:, :, None].astype(float) - angles[1]).sum(-1).argmin(-1) / 255 * NORMAL_RANGE

@@ -33,15 +33,15 @@ def brute_force(surfels, origin, direction, solid=0.2):
     t_u, t_v, normal = (np.array(v).T for v in surfels.frames())
     extent = np.sqrt(2 * np.log(np.maximum(s["opacities"] / solid, 1)))
     nearest, number, front = np.full(len(origin), np.inf), np.full(len(origin), -1), np.zeros(len(origin), bool)
-    place = np.zeros((len(origin), 2))
+    uv_hit = np.zeros((len(origin), 2))
     for i in range(len(surfels)):
         cosine = direction @ normal[i]
         t = ((s["centers"][i] - origin) @ normal[i]) / cosine
         offset = origin + t[:, None] * direction - s["centers"][i]
         uv = np.stack([offset @ t_u[i], offset @ t_v[i]], 1) / s["scales"][i]
-        met = (abs(uv) < extent[i]).all(1) & (t > 0) & (t < nearest)
-        nearest[met], number[met], front[met], place[met] = t[met], i, cosine[met] < 0, uv[met]
-    return number, front, place
+        hit = (abs(uv) < extent[i]).all(1) & (t > 0) & (t < nearest)
+        nearest[hit], number[hit], front[hit], uv_hit[hit] = t[hit], i, cosine[hit] < 0, uv[hit]
+    return number, front, uv_hit
 
 
 @pytest.mark.parametrize("two_sided", [True, False])
@@ -52,13 +52,13 @@ def test_rays_meet_what_brute_force_says(two_sided):
     direction = 0.5 * rng.normal(size=(4000, 3)) - origin  # inwards, mostly
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     normal = np.zeros((4000, 3))
-    found, number, place = Proxies(surfels).meet(mi.Point3f(origin.T), mi.Vector3f(normal.T), mi.Vector3f(direction.T))
+    found, number, uv = Proxies(surfels).intersect(mi.Point3f(origin.T), mi.Vector3f(normal.T), mi.Vector3f(direction.T))
     expected, front, where = brute_force(surfels, origin, direction)
-    met = (expected >= 0) & (front | two_sided)
-    assert 0.1 < met.mean() < 0.9
-    differs = (found.numpy() != met) | met & (number.numpy() != expected)
+    hit = (expected >= 0) & (front | two_sided)
+    assert 0.1 < hit.mean() < 0.9
+    differs = (found.numpy() != hit) | hit & (number.numpy() != expected)
     assert differs.mean() < 1e-3  # rays along an edge, in single precision
-    assert np.allclose(place.numpy().T[met & ~differs], where[met & ~differs], atol=1e-3)
+    assert np.allclose(uv.numpy().T[hit & ~differs], where[hit & ~differs], atol=1e-3)
 
 
 def test_what_rays_meet_reflects_by_normals_that_turn():
@@ -89,12 +89,12 @@ def test_what_rays_meet_reflects_by_normals_that_turn():
         )
         indirect = Indirect("one_bounce", Proxies(surfels), surfels)
         none = dr.zeros(mi.Color3f, dr.width(direction))
-        mine = indirect.cover(
+        mine = indirect.incident_radiance(
             none, mi.Point3f(normal - direction), mi.Vector3f(0), direction, deferred.Lighting(estimator, indirect=indirect)
         ).numpy()
-        met = mine.max(0) > 0
-        assert met.mean() > 0.9
-        return abs(mine - expected)[:, met].mean()
+        hit = mine.max(0) > 0
+        assert hit.mean() > 0.9
+        return abs(mine - expected)[:, hit].mean()
 
     assert 3 * error([1, 0, 1]) < error([0, 0, 0])
 
@@ -279,10 +279,14 @@ def test_share_of_diffuse_light_under_a_disc(two_sided):
     """(9) under a constant light: a disc hides r²/(r² + h²) of a hemisphere's cosine."""
     surfels = replace(disc_over_a_patch(), two_sided=two_sided)
     light = lighting(surfels, "visibility", lit=True)
-    share = np.mean([light.with_share(seed).indirect.share.numpy()[:, 0] for seed in range(40)], 0)
+    irradiance_visibility = np.mean(
+        [light.with_irradiance_visibility(seed).indirect.irradiance_visibility.numpy()[:, 0] for seed in range(40)], 0
+    )
     radius, height = 0.4 + 0.02, 0.5 - 0.02  # quads reach nearly two standard deviations; rays start as far above
-    below = share[0] == 1  # where a surfel that shows from behind is hidden by nothing
-    assert below if two_sided else share[0] == pytest.approx(1 - radius**2 / (radius**2 + height**2), abs=0.01)
+    below = irradiance_visibility[0] == 1  # where a surfel that shows from behind is hidden by nothing
+    assert (
+        below if two_sided else irradiance_visibility[0] == pytest.approx(1 - radius**2 / (radius**2 + height**2), abs=0.01)
+    )
 
 
 @pytest.mark.parametrize("kind", ["visibility", "one_bounce"])
@@ -299,7 +303,7 @@ def test_diffuse_light_of_split_sum_is_that_of_monte_carlo(kind):
         two_sided=False,
     )
     lightings = [lighting(surfels, *how, lit=True) for how in ((kind, True), (None,), (kind,))]
-    lightings[2] = lightings[2].with_share()
+    lightings[2] = lightings[2].with_irradiance_visibility()
     expected, free, shared = (array(deferred.render(surfels, CAMERA, l).diffuse)[..., 0] for l in lightings)
     floor = floor_reflecting(truth(), WALL)
     error = lambda image: abs(image - expected)[floor].mean() / expected[floor].mean()

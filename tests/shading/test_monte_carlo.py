@@ -104,7 +104,7 @@ def test_many_samples_are_taken_in_parts(monkeypatch):
     from rgs_mi.shading import monte_carlo
 
     whole = reflected(estimator(texels(), 40), "specular").numpy()
-    monkeypatch.setattr(monte_carlo, "_LANES", 4 * 7)
+    monkeypatch.setattr(monte_carlo, "_WAVEFRONT", 4 * 7)
     assert np.allclose(reflected(estimator(texels(), 40), "specular").numpy(), whole, rtol=1e-5)
 
 
@@ -136,13 +136,13 @@ def test_paired_estimates_free_the_squared_error_of_noise_bias():
 
     def derivative(paired, samples, copies):
         arrays, arguments = surfaces(differentiate=("roughness",))
-        lane = dr.arange(mi.UInt32, n * copies) % n + 1
-        roughness = dr.gather(mi.Float, arrays["roughness"], lane)
+        index = dr.arange(mi.UInt32, n * copies) % n + 1
+        roughness = dr.gather(mi.Float, arrays["roughness"], index)
         dr.eval(roughness)
         leaf = mi.Float(dr.detach(roughness))
         dr.enable_grad(leaf)
         normal, view, _, metallic, color = (dr.detach(v) for v in arguments)
-        spread = lambda v: dr.gather(type(v), v, lane)
+        spread = lambda v: dr.gather(type(v), v, index)
         C = estimator(environment, samples, 1, paired=paired).specular(
             spread(normal), spread(view), leaf, spread(metallic), spread(color)
         )

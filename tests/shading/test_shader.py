@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rgs_mi.commands.optimize import optimize
-from rgs_mi.core.arrays import lanes
+from rgs_mi.core.arrays import as_float
 from rgs_mi.core.errors import UserError
 from rgs_mi.core.scene_files import load_scene
 from rgs_mi.export.render import render_scene
@@ -54,7 +54,7 @@ def reference(weights, values):
 
 def evaluate(weights, values):
     """(f_φ, the arrays it was computed from: weights, C_s, roughness, cosine), which have gradients enabled."""
-    inputs = (mi.TensorXf(weights), mi.Color3f(*map(lanes, values[:3])), lanes(values[3]), lanes(values[4]))
+    inputs = (mi.TensorXf(weights), mi.Color3f(*map(as_float, values[:3])), as_float(values[3]), as_float(values[4]))
     dr.enable_grad(inputs)
     return Shader(inputs[0])(*inputs[1:]), inputs
 
@@ -80,10 +80,10 @@ def test_gradients_equal_finite_differences_of_the_twin():
     factor = rng.normal(size=(3, PIXELS - 1)) / (1 + values[:3])
     loss = lambda w, x: (reference(w, x) * factor).sum()
     out, inputs = evaluate(weights, values)
-    dr.backward(sum(dr.sum(c * lanes(f)) for c, f in zip(out, factor)))
+    dr.backward(sum(dr.sum(c * as_float(f)) for c, f in zip(out, factor)))
     gradients = [dr.grad(v).numpy().astype(np.float64) for v in inputs]
     gradients = [gradients[0], np.concatenate([gradients[1], *(g[None] for g in gradients[2:])])]
-    slopes = 0.0
+    normal_derivatives = 0.0
     for k, base in enumerate((weights, values)):
         expected, h = np.empty(base.size), 1e-6
         for i in range(base.size):
@@ -94,12 +94,12 @@ def test_gradients_equal_finite_differences_of_the_twin():
             expected[i] = (high - low) / (2 * h)
         np.testing.assert_allclose(gradients[k].ravel(), expected, rtol=2e-3, atol=2e-4 * abs(expected).max())
         tangent = np.sign(expected).reshape(base.shape)  # uphill: nothing cancels
-        slopes += (tangent.ravel() * expected).sum()
+        normal_derivatives += (tangent.ravel() * expected).sum()
         for value, t in zip((inputs[0],) if k == 0 else inputs[1:], (tangent,) if k == 0 else (tangent[:3], *tangent[3:])):
-            dr.set_grad(value, mi.Color3f(*map(lanes, t)) if t.ndim == 2 else type(value)(lanes(t)))
+            dr.set_grad(value, mi.Color3f(*map(as_float, t)) if t.ndim == 2 else type(value)(as_float(t)))
     out = Shader(inputs[0])(*inputs[1:])
     dr.forward_to(out)
-    assert (dr.grad(out).numpy() * factor).sum() == pytest.approx(slopes, rel=1e-3)
+    assert (dr.grad(out).numpy() * factor).sum() == pytest.approx(normal_derivatives, rel=1e-3)
 
 
 def test_no_kernel_is_compiled_for_another_number_of_pixels():
@@ -127,7 +127,7 @@ def mlp_model():
 
 
 def test_trained_along_and_resumed(dataset):
-    density = Density(start=0.0, stop=1.0, interval=4, threshold=1e-5, max_surfels=400)
+    density = Density(start=0.0, stop=1.0, refine_every=4, grow_grad2d=1e-5, max_surfels=400)
     fits = [Fit(dataset, mlp_model(), replace(SETTINGS, density=density), 1.0) for _ in range(2)]
     for _ in range(3):
         fits[0].step()
@@ -144,11 +144,11 @@ def test_trained_along_and_resumed(dataset):
 
 def test_a_shader_learns_what_the_identity_cannot(dataset):
     """All else frozen at a light of half the brightness: the gain makes up for it."""
-    still = {name: (1e-9, 1e-9) for name in vars(SETTINGS.rates)}
+    still = {name: (1e-9, 1e-9) for name in vars(SETTINGS.learning_rates)}
     psnr = {}
     for shaded in (model(), mlp_model()):
         shaded.set("log_environment", shaded.numpy("log_environment") - np.log(2))
-        settings = replace(SETTINGS, rates=replace(SETTINGS.rates, **still | {"shader": (2e-2, 2e-2)}))
+        settings = replace(SETTINGS, learning_rates=replace(SETTINGS.learning_rates, **still | {"shader": (2e-2, 2e-2)}))
         fit = Fit(dataset, shaded, settings, 1.0)
         while fit.progress < 1:
             fit.step()
@@ -166,7 +166,7 @@ def run(tmp_path_factory):
 
     rgs_mi.set_variant()
     scene, data = make_inputs(tmp_path_factory.mktemp("inputs"))
-    overrides = [*SMALL, "shader=mlp", "rates.shader=[5e-2,5e-2]"]
+    overrides = [*SMALL, "shader=mlp", "learning_rates.shader=[5e-2,5e-2]"]
     return optimize(scene, data=data, out=tmp_path_factory.mktemp("runs"), overrides=overrides, quiet=True), scene, data
 
 

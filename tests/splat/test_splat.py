@@ -15,8 +15,8 @@ from rgs_mi.surfels.surfels import CHANNELS, Surfels
 from scenes import layered_surfels, orbit_camera, sphere_surfels, tangent_surfels
 
 MAPS = ("diffuse", "normal", "base_color", "roughness", "metallic", "delta_normal", "depth", "square", "alpha")
-SORTED = Cutoffs(window=96)  # more than the surfels of any tile here that overlap
-SMOOTH = Cutoffs(alpha_min=1e-7, alpha_max=0.9999, transmittance_min=0, window=96)
+SORTED = Cutoffs(resort_window=96)  # more than the surfels of any tile here that overlap
+SMOOTH = Cutoffs(alpha_min=1e-7, alpha_max=0.9999, transmittance_min=0, resort_window=96)
 
 
 def render_gbuffer(surfels, camera, cutoffs=Cutoffs()):
@@ -88,7 +88,7 @@ def test_window_brings_tiles_into_order():
     surfels, camera = replace(sphere_surfels(20_000), two_sided=False), orbit_camera(size=(96, 96))
 
     def image(shift, window):
-        maps = render_gbuffer(surfels, camera.cropped(-shift, -shift, 104, 104), Cutoffs(window=window))
+        maps = render_gbuffer(surfels, camera.cropped(-shift, -shift, 104, 104), Cutoffs(resort_window=window))
         return stacked(maps).reshape(17, 104, 104)[:, shift : shift + 96, shift : shift + 96]
 
     seams = {window: np.square(image(0, window) - image(4, window)).mean() for window in (1, 16)}

@@ -137,7 +137,7 @@ def test_scene_renders(model):
     """Every part of a model is in its scene, and light comes from it on every channel."""
     import mitsuba as mi
 
-    scene = mi.load_file(str(SCENES / f"{model}.xml"), width=24, height=24, spp=4, resolution=64)
+    scene = mi.load_file(str(SCENES / f"{model}.xml"), width=24, height=24, spp=4, envmap_height=64)
     # Mitsuba joins shapes that share a BSDF.
     assert sum(shape.face_count() for shape in scene.shapes()) == sum(len(m.faces) for m in parts_of(model).values())
     image = np.array(mi.render(scene))
@@ -155,7 +155,7 @@ def test_plugins_load_from_xml():
             <bsdf type="principled" id="metal"> <float name="roughness" value="0.1"/> </bsdf>
         </shape>
         <emitter type="procedural_envmap" id="light">
-            <string name="name" value="studio"/> <integer name="resolution" value="16"/>
+            <string name="name" value="studio"/> <integer name="height" value="16"/>
             <transform name="to_world"> <rotate x="1" angle="90"/> </transform>
         </emitter></scene>""")
     (shape,), part = scene.shapes(), targets.mesh("helmet", "visor")
@@ -178,7 +178,7 @@ def test_environment_is_z_up():
         {
             "type": "procedural_envmap",
             "name": "studio",
-            "resolution": 256,
+            "height": 256,
             "to_world": mi.ScalarTransform4f().rotate([1, 0, 0], 90),
         }
     )

@@ -27,7 +27,7 @@ def test_monte_carlo_equals_path(case):
     """Specular and diffuse; the toaster, whose slots are dark, with the rays of its own scene."""
     result = Validator(16, 64).run(case)
     assert result.difference.equal
-    assert len(result.lanes) > 40 and result.picture(result.truth).shape == (16, 16, 3)
+    assert len(result.pixels) > 40 and result.picture(result.truth).shape == (16, 16, 3)
 
 
 def test_split_sum_is_within_bounds():

@@ -1,8 +1,8 @@
 """
-Values of a wavefront as a texture (:monosp:`lanes`)
+Values of a wavefront as a texture (:monosp:`wavefront`)
 -----------------------------------------------------
 
-Lane number *k* of an evaluation sees entry number *k* of ``values``, whatever the surface: so a BSDF of Mitsuba's can be
+Lane *k* of an evaluation sees entry *k* of ``values``, whatever the surface: so a BSDF of Mitsuba's can be
 evaluated for many materials at once, each lane its own. Set ``values`` before each evaluation; its width must be one or that
 of the evaluation. For code, not for scene files.
 
@@ -16,7 +16,7 @@ of the evaluation. For code, not for scene files.
 import mitsuba as mi
 
 
-class LaneTexture(mi.Texture):
+class WavefrontTexture(mi.Texture):
     """``values``: ``mi.Float`` for one channel, ``mi.Color3f`` for three."""
 
     def __init__(self, props):
@@ -37,7 +37,7 @@ class LaneTexture(mi.Texture):
         return True
 
     def to_string(self):
-        return f"LaneTexture[channels = {self.channels}]"
+        return f"WavefrontTexture[channels = {self.channels}]"
 
 
-mi.register_texture("lanes", LaneTexture)
+mi.register_texture("wavefront", WavefrontTexture)
