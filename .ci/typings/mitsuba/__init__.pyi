@@ -1,0 +1,5 @@
+"""Everything of mitsuba is Any: its own stubs are written for one variant and reject arithmetic that runs."""
+
+from typing import Any
+
+def __getattr__(name: str) -> Any: ...
