@@ -35,9 +35,11 @@ def write_pages(app):
             parts.append(f".. automodule:: {name}\n   :members:\n   :ignore-module-all:\n")
         (out / f"{package}.rst").write_text("\n".join(parts))
     entries = "".join(f"   {package}\n" for package in folders())
-    (out / "index.rst").write_text(f"{_title('Programming interface', '=')}\n"
-                                   f"One page a folder of ``{PACKAGE}``, from its docstrings.\n\n"
-                                   f".. toctree::\n   :maxdepth: 1\n\n{entries}")
+    (out / "index.rst").write_text(
+        f"{_title('Programming interface', '=')}\n"
+        f"One page a folder of ``{PACKAGE}``, from its docstrings.\n\n"
+        f".. toctree::\n   :maxdepth: 1\n\n{entries}"
+    )
 
 
 def _title(text, line):

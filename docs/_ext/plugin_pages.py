@@ -8,8 +8,13 @@ from docutils.parsers.rst import Directive
 
 #: What docstrings abbreviate, |int| and the like, as Mitsuba's documentation does.
 _TYPES = ("int", "bool", "float", "string", "transform", "tensor", "bsdf", "emitter", "texture")
-_FLAGS = {"exposed": "exposed", "differentiable": "differentiable", "discontinuous": "discontinuous",
-          "true": "``true``", "false": "``false``"}
+_FLAGS = {
+    "exposed": "exposed",
+    "differentiable": "differentiable",
+    "discontinuous": "discontinuous",
+    "true": "``true``",
+    "false": "``false``",
+}
 _HEADER = ("Parameter", "Type", "Description", "Flags")
 
 
@@ -21,9 +26,13 @@ class PluginParameters(Directive):
     def run(self):
         holder = nodes.container()
         self.state.nested_parse(self.content, self.content_offset, holder)
-        rows = [[cell.children for cell in row.children[0].children] for item in holder.findall(nodes.bullet_list)
-                if item.parent is holder or isinstance(item.parent, nodes.block_quote) for row in item.children]
-        return [table(_HEADER[:max(map(len, rows))], rows)]
+        rows = [
+            [cell.children for cell in row.children[0].children]
+            for item in holder.findall(nodes.bullet_list)
+            if item.parent is holder or isinstance(item.parent, nodes.block_quote)
+            for row in item.children
+        ]
+        return [table(_HEADER[: max(map(len, rows))], rows)]
 
 
 def table(header, rows):

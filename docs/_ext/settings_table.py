@@ -26,15 +26,27 @@ def walk(cls):
     if hasattr(cls, "model_fields"):  # pydantic
         for name, field in cls.model_fields.items():
             bound = {k: getattr(m, k) for m in field.metadata for k in ("ge", "le", "gt", "lt") if hasattr(m, k)}
-            yield (name, field.annotation, field.get_default(call_default_factory=True),
-                   bound.get("ge", bound.get("gt")), bound.get("le", bound.get("lt")), field.description or "")
+            yield (
+                name,
+                field.annotation,
+                field.get_default(call_default_factory=True),
+                bound.get("ge", bound.get("gt")),
+                bound.get("le", bound.get("lt")),
+                field.description or "",
+            )
         return
     hints, source = typing.get_type_hints(cls), inspect.getsource(cls)
     for field in dataclasses.fields(cls):
         factory = field.default_factory
         default = field.default if factory is dataclasses.MISSING else factory()
-        yield (field.name, hints[field.name], default, field.metadata.get("min"), field.metadata.get("max"),
-               _comment(source, field.name))
+        yield (
+            field.name,
+            hints[field.name],
+            default,
+            field.metadata.get("min"),
+            field.metadata.get("max"),
+            _comment(source, field.name),
+        )
 
 
 def _comment(source, name):
@@ -64,8 +76,9 @@ def _tables(cls, prefix):
         if _is_model(annotation):
             below.append((annotation, f"{prefix}{name}."))
             continue
-        rows.append([_code(prefix + name), _code(_type(annotation)), _code(_value(default)), _plain(_range(low, high)),
-                     _plain(text)])
+        rows.append(
+            [_code(prefix + name), _code(_type(annotation)), _code(_value(default)), _plain(_range(low, high)), _plain(text)]
+        )
     if prefix:
         yield nodes.rubric(text=prefix[:-1])
         yield nodes.paragraph(text=" ".join((inspect.getdoc(cls) or "").split()))
@@ -88,7 +101,9 @@ def _type(annotation):
         return annotation.__name__
     if typing.get_origin(annotation) in (tuple, list):
         items = typing.get_args(annotation)
-        return f"list of {_type(items[0])}" if items[-1] is Ellipsis or len(items) == 1 else f"{len(items)} × {_type(items[0])}"
+        return (
+            f"list of {_type(items[0])}" if items[-1] is Ellipsis or len(items) == 1 else f"{len(items)} × {_type(items[0])}"
+        )
     if typing.get_origin(annotation) is dict:
         return "mapping"
     return " | ".join(_type(a) for a in typing.get_args(annotation)) or str(annotation)
@@ -108,8 +123,13 @@ def _value(default):
 def _range(low, high):
     if low is None and high is None:
         return ""
-    return f"{_value(low)} to {_value(high)}" if None not in (low, high) else \
-        f"at least {_value(low)}" if high is None else f"at most {_value(high)}"
+    return (
+        f"{_value(low)} to {_value(high)}"
+        if None not in (low, high)
+        else f"at least {_value(low)}"
+        if high is None
+        else f"at most {_value(high)}"
+    )
 
 
 def _code(text):
