@@ -1,0 +1,5 @@
+"""Everything of drjit.nn is Any."""
+
+from typing import Any
+
+def __getattr__(name: str) -> Any: ...
