@@ -28,7 +28,7 @@ _FACTS = {
     "iterations": int,
     "surfels": int,
     "parameters": int,
-    "peak_rss_mb": (int, float),
+    "peak_rss_mb": (int, float, type(None)),
     "train_views": int,
     "test_views": int,
     "settings": dict,

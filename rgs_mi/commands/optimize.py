@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.bounding_box import BoundingBox
+from ..core.caches import cache_folder
 from ..core.errors import UserError
 from ..core.files import make_folder
 from ..core.interrupt import GracefulInterrupt
@@ -24,7 +25,6 @@ from ..priors.initialization import initial_points, surroundings
 from ..report import results
 from ..settings.config import to_dict
 
-_PRIORS = Path("data") / "priors"  # what is known of depths is kept here, below the current folder
 _ON_SURFACE, _ANYWHERE = 0.7, 0.1  # opacities to start with; where surfels fill space, more would hide what is within
 _SMOOTHING = 0.95  # of the PSNR that the progress line shows
 
@@ -146,7 +146,7 @@ def _priors(dataset, settings):
     """The depth prior of each training view, or None."""
     if settings.weights.depth == 0:
         return None
-    return depth_priors(settings.prior.name, dataset.train, cache=_PRIORS, **settings.prior.options)
+    return depth_priors(settings.prior.name, dataset.train, cache=cache_folder("priors"), **settings.prior.options)
 
 
 def _resume(saved, scene, dataset, settings) -> Fit:

@@ -1,4 +1,4 @@
-"""Finds an LLVM that works, sets Mitsuba's variant: the only module that touches the environment.
+"""The machine: finds an LLVM that works, sets Mitsuba's variant, measures memory.
 
 Dr.Jit's CPU backend loads libLLVM at run time. Version 15 loads and then aborts the process in ``dr.clip``; older ones
 are refused with a misleading message. On Linux x86-64 the wheel ``karellen-llvm-core`` brings a recent one into the
@@ -92,3 +92,13 @@ def set_variant(name: str = "llvm_ad_rgb"):
             f"Dr.Jit had loaded LLVM {dr.detail.llvm_version()[0]} before rgs_mi could choose one: "
             "import rgs_mi before drjit and mitsuba"
         )
+
+
+def peak_rss_mb() -> float | None:
+    """Most memory that this process has held, in MiB; None where the system does not say (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)  # macOS counts bytes, Linux KiB

@@ -4,6 +4,7 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..core.caches import cache_folder
 from ..core.camera import Camera
 from ..core.errors import UserError
 from ..core.scene_files import load_scene
@@ -16,7 +17,6 @@ from ..settings.settings import Settings
 from ..shading.deferred import Shading
 from ..shading.environment import Environment
 
-RENDERED = Path("data")  # photographs of path-traced scenes are kept here, below the current folder
 _ENVIRONMENTS = ("envmap", "procedural_envmap", "constant")
 
 
@@ -104,5 +104,5 @@ class FitScene:
         """The photographs; those of a scene are path-traced on first use, which takes minutes."""
         folder = self.photographs
         if folder.suffix == ".xml":
-            folder = render_dataset(folder, RENDERED / folder.stem, quiet=quiet)
+            folder = render_dataset(folder, cache_folder(folder.stem), quiet=quiet)
         return load_dataset(folder)
