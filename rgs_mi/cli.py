@@ -4,8 +4,8 @@ neither help nor a bad option starts Mitsuba."""
 import argparse
 import sys
 
-from .core.caches import VARIABLE, cache_folder
 from .core.errors import run_main
+from .core.runtime import CACHE_VARIABLE, cache_folder
 from .verbs import fits, renderings, suites
 from .verbs.arguments import Parser
 
@@ -31,7 +31,7 @@ def _run(arguments):
     parser = argparse.ArgumentParser(
         prog="rgs-mi",
         description="Reflection-aware Gaussian splatting: photographs of a shiny object in, a relightable Mitsuba asset out.",
-        epilog=f"What takes long to compute is kept in the folder that the environment variable {VARIABLE} names, now "
+        epilog=f"What takes long to compute is kept in the folder that the environment variable {CACHE_VARIABLE} names, now "
         f"'{cache_folder()}'. 'rgs-mi VERB --help' says more, for 'optimize' also of all settings.",
     )
     verbs = parser.add_subparsers(required=True, metavar="VERB", parser_class=Parser)

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from ..core.bounding_box import BoundingBox
-from ..core.caches import cache_folder
 from ..core.errors import UserError
 from ..core.files import make_folder
 from ..core.interrupt import GracefulInterrupt
 from ..core.progress import Progress
+from ..core.runtime import cache_folder
 from ..fit import checkpoint
 from ..fit.events import Events
 from ..fit.model import Model

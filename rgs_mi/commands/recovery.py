@@ -19,8 +19,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import as_float
-from ..core.caches import cache_folder
 from ..core.files import atomic_file, write_png
+from ..core.runtime import cache_folder
 from ..core.scene_files import load_scene, spp_of
 from ..datasets import load_dataset
 from ..datasets.path_traced import render_dataset

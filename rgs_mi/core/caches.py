@@ -1,6 +1,5 @@
-"""What takes long to compute and is kept: path-traced photographs, depth priors, undistorted photographs."""
+"""Arrays that take long to compute, and are kept."""
 
-import os
 import warnings
 from pathlib import Path
 
@@ -8,14 +7,6 @@ import numpy as np
 
 from .errors import UserError
 from .files import atomic_file
-
-VARIABLE = "RGS_MI_CACHE"
-
-
-def cache_folder(kind: str = "") -> Path:
-    """The folder ``kind`` of what is kept, below the one that the environment variable `VARIABLE` names (default: ``data``
-    below the current folder)."""
-    return Path(os.environ.get(VARIABLE) or "data") / kind
 
 
 def cached_arrays(path, check, compute) -> dict[str, np.ndarray]:

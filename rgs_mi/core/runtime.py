@@ -15,6 +15,7 @@ from .errors import UserError
 
 MIN_LLVM = 16
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
+CACHE_VARIABLE = "RGS_MI_CACHE"
 _VARIABLE = "DRJIT_LIBLLVM_PATH"
 _REMEDY = (
     f"install one (Debian: `apt install libllvm19`, macOS: `brew install llvm`, Linux x86-64: "
@@ -92,6 +93,12 @@ def set_variant(name: str = "llvm_ad_rgb"):
             f"Dr.Jit had loaded LLVM {dr.detail.llvm_version()[0]} before rgs_mi could choose one: "
             "import rgs_mi before drjit and mitsuba"
         )
+
+
+def cache_folder(kind: str = "") -> Path:
+    """The folder ``kind`` of what takes long to compute and is kept, path-traced photographs, depth priors and undistorted
+    photographs: below the one that the environment variable `CACHE_VARIABLE` names, or ``data`` in the current folder."""
+    return Path(os.environ.get(CACHE_VARIABLE) or "data") / kind
 
 
 def peak_rss_mb() -> float | None:

@@ -15,9 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from ..core.caches import cache_folder, cached_arrays
+from ..core.caches import cached_arrays
 from ..core.camera import Camera
 from ..core.color import srgb_decode, srgb_encode
+from ..core.runtime import cache_folder
 
 _VERSION = 1  # of everything that decides what is in the pixels: a cached photograph of another version is not read
 _SRGB_TO_LINEAR = srgb_decode(np.arange(256) / 255).astype(np.float32)

@@ -4,9 +4,9 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..core.caches import cache_folder
 from ..core.camera import Camera
 from ..core.errors import UserError
+from ..core.runtime import cache_folder
 from ..core.scene_files import load_scene
 from ..datasets import load_dataset
 from ..datasets.path_traced import render_dataset

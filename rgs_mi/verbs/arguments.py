@@ -1,6 +1,8 @@
 """Arguments that several verbs have."""
 
 import argparse
+import shutil
+import textwrap
 from pathlib import Path
 
 from ..core.errors import listed
@@ -21,10 +23,11 @@ def _settings_help():
     from ..settings.fields import walk
     from ..settings.settings import Settings
 
-    entries = []
+    entries, width = [], max(60, shutil.get_terminal_size().columns)
     for s in walk(Settings):
         values = ", ".join(filter(None, (s.kind, s.range)))
-        entries.append(f"  {s.key} = {s.default}\n      {values}. {s.description}")
+        text = textwrap.wrap(f"{values}. {s.description}", width - 6)
+        entries.append("\n      ".join([f"  {s.key} = {s.default}", *text]))
     return "\n".join(["\nsettings, which --set and YAML files change:", *entries, ""])
 
 

@@ -2,9 +2,8 @@
 
 from pathlib import Path
 
-from ..core.caches import VARIABLE, cache_folder
 from ..core.errors import parse_variables
-from ..core.runtime import set_variant
+from ..core.runtime import CACHE_VARIABLE, cache_folder, set_variant
 from ..core.scene_files import find_scene
 from .arguments import add_common, add_integer, add_variables, known
 
@@ -81,7 +80,9 @@ def render(parser):
 def render_dataset(parser):
     """Path-trace a Mitsuba scene into a data set in the Blender layout: photographs, cameras, normals and other maps."""
     parser.add_argument("scene", help=f"an XML file, or {known('targets')}")
-    parser.add_argument("--out", type=Path, metavar="DIR", help=f"folder to write (default: NAME in that of {VARIABLE})")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help=f"folder to write (default: NAME in that of {CACHE_VARIABLE})"
+    )
     add_integer(parser, "--train", 60, "training views")
     add_integer(parser, "--test", 20, "test views")
     add_integer(parser, "--size", 400, "pixels along a side")
