@@ -6,8 +6,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.bounding_box import BoundingBox
+from ..core.camera import opaque, pixel_directions
 from ..splat.gbuffer import render_gbuffer
-from ..splat.project import opaque
 from .indirect import Indirect
 from .monte_carlo import SAMPLES, MonteCarlo
 from .shader import Shader
@@ -111,15 +111,6 @@ class Image:
     diffuse: "mi.Color3f"
     specular: "mi.Color3f"
     gbuffer: object
-
-
-def pixel_directions(camera, index):
-    """Unit world-space directions through the centres of pixels number ``index`` (row-major)."""
-    R, _, f, principal = opaque(camera)
-    width = camera.size[0]
-    x = (mi.Float(index % width) + 0.5 - principal.x) / f.x
-    y = (mi.Float(index // width) + 0.5 - principal.y) / f.y
-    return dr.normalize(R.T @ mi.Vector3f(x, y, 1))
 
 
 def shade(gbuffer, camera, lighting: Lighting | None) -> Image:
