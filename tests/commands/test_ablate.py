@@ -17,7 +17,6 @@ from rgs_mi.core import subprocesses
 from rgs_mi.core.errors import UserError
 from rgs_mi.fit.scene import FitScene
 from rgs_mi.report import comparison, results
-from rgs_mi.settings.config import to_dict
 
 from runs import PATIENCE, ROOT, TARGET, make_suite, start, start_script, wait_for
 

@@ -13,7 +13,6 @@ from rgs_mi.core.errors import UserError
 from rgs_mi.settings import config, fields, settings
 from rgs_mi.settings.config import load_config, presets, to_dict
 
-
 MODEL = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
