@@ -130,7 +130,7 @@ class Density:
         None,
         ge=1,
         le=10_000_000,
-        description=f"At most so many surfels. Unless given, {_SURFELS}, or {_SURFELS_A_MINUTE} a minute where that is more.",
+        description=f"Never more surfels than this; unless given, {_SURFELS}, or {_SURFELS_A_MINUTE} a minute if more.",
     )
     guided: bool = Field(
         False,
