@@ -1,8 +1,4 @@
-<<<<<<< HEAD
-"""The machine: finds an LLVM that works, sets Mitsuba's variant, measures memory.
-=======
-"""Finds an LLVM that works and sets Mitsuba's variant: the only module that touches environment variables.
->>>>>>> main
+"""The machine: finds an LLVM that works, sets Mitsuba's variant, says where caches lie and how much memory was used.
 
 Dr.Jit's CPU backend loads libLLVM at run time. Version 15 loads and then aborts the process in ``dr.clip``; older ones
 are refused with a misleading message. On Linux x86-64 the wheel ``karellen-llvm-core`` brings a recent one into the
