@@ -1,4 +1,4 @@
-"""A fit from beginning to end: photographs and scene in, a run's folder out. What `scripts/optimize.py` calls."""
+"""A fit from beginning to end: photographs and scene in, a run's folder out. What `rgs-mi optimize` calls."""
 
 import shutil
 import sys

@@ -1,5 +1,5 @@
 """How true a fit's light and materials are: against the path-traced scene that its photographs are of, and under other
-lights. What `scripts/recovery.py` calls.
+lights. What `rgs-mi recovery` calls.
 
     OUT/recovery.json       the figures below
     OUT/relit_NAME.png      a few views under each light: the truth, the fit, three times their difference

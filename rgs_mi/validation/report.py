@@ -1,4 +1,4 @@
-"""What `scripts/crossvalidate.py` calls.
+"""What `rgs-mi crossvalidate` calls.
 
 OUT/crossvalidation.html    everything on one page
 OUT/cases.csv               a row a case
