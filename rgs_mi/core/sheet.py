@@ -7,7 +7,7 @@ import numpy as np
 from .files import atomic_file
 
 INK = "#3c3c3c"
-_DPI = 100  # of Matplotlib's inches; lengths here are pixels
+_DPI = 128  # of Matplotlib's inches, a power of two, so that pixels stay whole; lengths here are pixels
 _LINE = 1.5  # a line's height, in sizes of the text
 
 

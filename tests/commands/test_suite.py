@@ -263,7 +263,7 @@ def test_tables():
         "## Budget, Shiny Blender",
     ]
     lines = [[c.strip() for c in line.split("|")[1:-1]] for line in "\n".join(sections).splitlines() if "|" in line]
-    assert lines[0] == ["", "Shiny Blender: PSNR", "Shiny Blender: SSIM", "Shiny Blender: LPIPS"]
+    assert lines[0] == ["", "Shiny Blender: PSNR, dB", "Shiny Blender: SSIM", "Shiny Blender: LPIPS"]
     of = [line[1:] for line in lines if line[0] == "RGS, the paper"]
     assert of == [
         ["35.38", "0.976", "0.050"],
