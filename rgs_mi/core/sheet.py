@@ -9,6 +9,7 @@ from .files import atomic_file
 INK = "#3c3c3c"
 _DPI = 128  # of Matplotlib's inches, a power of two, so that pixels stay whole; lengths here are pixels
 _LINE = 1.5  # a line's height, in sizes of the text
+_OF_FONT = 1.16  # the same, of Matplotlib's font by itself
 
 
 class Sheet:
@@ -33,15 +34,14 @@ class Sheet:
         heights = [max(round(width * shape[0] / shape[1]), 1) for shape in shapes]
         line = round(_LINE * text_size)
         lines = max((words.count("\n") + 1 for words in columns), default=0)
-        head = margin + 2 * line * bool(title)  # where words above columns begin
-        top = head + line * lines
+        top = margin + 2 * line * bool(title) + line * lines
         self.width = 2 * margin + max(map(len, rows)) * (width + gap) - gap
         self.height = top + sum(heights) + (len(rows) - 1) * gap + margin + below
         self.figure = Figure((self.width / _DPI, self.height / _DPI), dpi=_DPI, facecolor="white")
         if title:
             self.text(margin, margin, title, 1.5 * text_size)
         for k, words in enumerate(columns):
-            self.text(margin + k * (width + gap) + width / 2, head, words, text_size, ha="center")
+            self.text(margin + k * (width + gap) + width / 2, top - gap, words, text_size, ha="center", va="bottom")
         for row, height in zip(rows, heights):
             for k, image in enumerate(row):
                 if image is not None:
@@ -58,10 +58,10 @@ class Sheet:
         axes.imshow(image, aspect="auto", interpolation="lanczos", interpolation_stage="rgba")
 
     def text(self, left: float, top: float, words: str, size: float, **options):
-        """Write ``words`` of ``size`` pixels below and to the right of a pixel; ``options``: see `matplotlib.text.Text`."""
-        points = size * 72 / _DPI
-        at = left / self.width, 1 - top / self.height
-        self.figure.text(*at, words, size=points, color=INK, va="top", linespacing=_LINE / 1.2, parse_math=False, **options)
+        """Write ``words`` of ``size`` pixels below and to the right of a pixel, unless ``options`` of
+        `matplotlib.text.Text` say otherwise."""
+        options = {"va": "top", "linespacing": _LINE / _OF_FONT, "parse_math": False} | options
+        self.figure.text(left / self.width, 1 - top / self.height, words, size=size * 72 / _DPI, color=INK, **options)
 
     def write(self, path):
         """Write the sheet as a PNG. Raises: UserError where it can't be written."""

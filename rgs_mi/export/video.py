@@ -52,7 +52,7 @@ def over_white(file) -> np.ndarray:
     with Image.open(file) as image:
         pixels = np.asarray(image.convert("RGBA"), np.float32)
     alpha = pixels[..., 3:] / 255
-    return np.uint8(pixels[..., :3] * alpha + 255 * (1 - alpha) + 0.5)
+    return (pixels[..., :3] * alpha + 255 * (1 - alpha) + 0.5).astype(np.uint8)
 
 
 def sheet(frames) -> Sheet:
@@ -77,7 +77,7 @@ def _encode(path, frames, rate):
             first.shape[1::-1],
             fps=rate,
             codec="libx264",
-            quality=None,
+            quality=None,  # pyright: ignore[reportArgumentType]  # the rate factor below stands for it
             macro_block_size=1,
             output_params=[*_COLORS, *_QUALITY],
         )

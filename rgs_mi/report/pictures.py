@@ -1,5 +1,7 @@
 """Pictures of several fits side by side: the truth, then each fit, images and normals."""
 
+from textwrap import fill
+
 import numpy as np
 from PIL import Image
 
@@ -10,12 +12,13 @@ from ..evaluation.pictures import crop
 from .figures import text
 
 _PANEL, _GAP, _MARGIN = 260, 8, 24  # pixels
+_CHARACTERS = 22  # as wide as a panel
 
 
 def write(path, views, columns, background):
     """Write a picture of a scene: for each of ``views`` a row of images and one of normals. Columns: the truth, then
     ``columns``, [(label, figures of metrics.json, the run's folder)]; ``background``: as it was fitted with."""
-    labels = ["truth\n", *(f"{label}\n{_caption(figures)}" for label, figures, _ in columns)]
+    labels = ["truth", *(f"{fill(label, _CHARACTERS)}\n{_caption(figures)}" for label, figures, _ in columns)]
     rows = [row for view in views for row in _rows(view, [folder / "test" for _, _, folder in columns], background)]
     Sheet(rows, _PANEL, _GAP, _MARGIN, labels).write(path)
 

@@ -3,6 +3,7 @@
 import io
 import re
 from html import escape
+from typing import Any
 
 import numpy as np
 
@@ -11,8 +12,9 @@ from .figures import number
 _SIZE = 6.6, 3.5  # inches of 72 pixels
 _INKS = "#1f5fa8", "#c4572b", "#35803f", "#7a4ea3", "#97791a", "#666c73"
 _SOFT, _LINE, _BOUND = "#626a73", "#d9dde2", "#b33333"
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "font.size": 10,
+    "font.sans-serif": ["DejaVu Sans"],  # which Matplotlib brings; the page then has its own
     "svg.fonttype": "none",
     "svg.hashsalt": "rgs_mi",
     "text.color": _SOFT,
@@ -48,8 +50,10 @@ def curves(
         figure = draw(series, x_label, y_label, lines or {}, marks or {}, low, log)
         figure.savefig(stream, format="svg", transparent=True, metadata=_NO_METADATA)
     # Names of groups would be there twice in a page, and namespaces need not be told in HTML.
-    box, content = re.search(r'<svg [^>]*viewBox="(.*?)"[^>]*>(.*)', stream.getvalue(), re.DOTALL).groups()
-    content = re.sub(r' id="[a-z0-9]+_\d+"', "", content)
+    _, _, text = stream.getvalue().partition('viewBox="')
+    box, _, text = text.partition('"')
+    content = text.partition(">")[2]
+    content = re.sub(r' id="[\w.]+_\d+"', "", content)
     return f'<svg viewBox="{box}" role="img" aria-label="{escape(f"{y_label} over {x_label}")}">{content.strip()}'
 
 

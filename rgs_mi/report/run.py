@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from skimage.measure import block_reduce
+from skimage.transform import downscale_local_mean
 
 from ..core.files import atomic_file
 from ..evaluation.evaluate import SCORES
@@ -102,7 +102,7 @@ def _shrunk(environment):
     """At most `_ENVIRONMENT` texels wide: means over blocks, in linear light."""
     k = -(-environment.shape[1] // _ENVIRONMENT)
     height, width = (n - n % k for n in environment.shape[:2])
-    return block_reduce(environment[:height, :width], (k, k, 1), np.mean)
+    return downscale_local_mean(environment[:height, :width], (k, k, 1))
 
 
 # ---- Settings ----
