@@ -67,7 +67,7 @@ def draw(series: dict, x_label: str, y_label: str, lines: dict, marks: dict, low
     for (name, (x, y)), ink in zip(series.items(), _INKS * (1 + len(series) // len(_INKS))):
         x, y = np.asarray(x, float), np.asarray(y, float)
         shown = np.isfinite(y) & ((y > 0) | (not log))
-        axes.plot(x[shown], y[shown], color=ink, label=name)
+        axes.plot(x[shown], y[shown], "o-" if shown.sum() == 1 else "-", color=ink, label=name)
     known = np.concatenate([[0.0], *(line.get_xdata() for line in axes.lines)])
     heights = np.concatenate([*(line.get_ydata() for line in axes.lines), [*lines.values()]])
     axes.set_xlim(0, known.max() or 1)

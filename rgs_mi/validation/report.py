@@ -59,7 +59,7 @@ def _row(r) -> dict:
         "z_of_sums": f"{r.difference.global_z:.2f}",
         "split_sum_error": f"{r.error:.4f}",
         "noise": f"{r.noise:.4f}",
-        "interreflection": f"{r.interreflection:.4f}",
+        "interreflection": f"{r.interreflection:+.4f}",
         "verdict": "; ".join(r.failures()) or "passes",
     }
 

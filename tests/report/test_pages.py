@@ -11,7 +11,7 @@ import yaml
 from rgs_mi import report
 from rgs_mi.evaluation.evaluate import SCORES
 from rgs_mi.fit.curves import Curves
-from rgs_mi.report import figures, html
+from rgs_mi.report import figures, html, tables
 
 from pages import Parsed, metrics
 
@@ -135,3 +135,10 @@ def test_figures_in_words():
 def test_addresses_are_of_files(path):
     address = html.href(path)
     assert address.startswith("./") and not set(address) & set(":?# ") and unquote(address) == f"./{path}"
+
+
+def test_cells_are_no_formulas():
+    """Words that a spreadsheet would calculate with are words; numbers with a sign are numbers."""
+    row = {"scene": "=1+1", "error": "@x", "note": "-a", "sum": "+0.5", "psnr": -1.5, "none": None}
+    assert tables.csv_text([row]) == "scene,error,note,sum,psnr,none\n'=1+1,'@x,'-a,+0.5,-1.5,\n"
+    assert tables.csv_text([], ["a", "b"]) == "a,b\n"
