@@ -213,7 +213,16 @@ def write_cloud(path, points=POINTS, colors=COLORS):
     return write_ply_rows(path, rows)
 
 
-PLY_TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint", "f4": "float", "f8": "double"}
+PLY_TYPES = {
+    "i1": "char",
+    "u1": "uchar",
+    "i2": "short",
+    "u2": "ushort",
+    "i4": "int",
+    "u4": "uint",
+    "f4": "float",
+    "f8": "double",
+}
 
 
 def write_ply_rows(path, rows, text=False, byte_order="<", before=(b"", b""), after=(b"", b"")):

@@ -144,7 +144,11 @@ def test_values_that_no_point_has(tmp_path, name):
         (b"property float x", b"property half x", "half"),
         (b"property float x", b"property list uchar float x", "have lists"),
         (b"property float x", b"property float x\xff", "ascii"),
-        (b"element vertex 4", b"element face 2\nproperty list uint double i\nelement vertex 4", "'face', which .* have lists"),
+        (
+            b"element vertex 4",
+            b"element face 2\nproperty list uint double i\nelement vertex 4",
+            "'face', which .* have lists",
+        ),
         (b"element vertex 4", b"element vertex 0", "holds no points"),
         (b"element vertex 4", b"property float u\nelement vertex 4", "the line 'property float u'"),
         (b"format binary_little_endian 1.0\n", b"", "no format"),
