@@ -30,7 +30,7 @@ def make_inputs(folder: Path, size=32) -> tuple[Path, Path]:
     (folder / "ball.xml").write_text(TARGET)
     data = render_dataset(folder / "ball.xml", folder / "ball", train=12, test=3, size=size, spp=4, radius=6, quiet=True)
     text = (ROOT / "scenes" / "object.xml").read_text()
-    (folder / "object.xml").write_text(text.replace('name="height" value="256"', 'name="rows" value="16"'))
+    (folder / "object.xml").write_text(text.replace('name="height" value="256"', 'name="height" value="16"'))
     return folder / "object.xml", data
 
 
