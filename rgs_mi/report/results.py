@@ -37,7 +37,7 @@ def write(fit, scene, folder, quiet):
             scene,
             surfels,
             environment,
-            *fit.begun,
+            fit.shading,
             fit.model.shader(),
             evaluation_views(fit.dataset),
             fit.settings.spp,

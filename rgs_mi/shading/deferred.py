@@ -29,6 +29,7 @@ class Shading:
     samples: int = SAMPLES
     eta: float = DEFAULT_ETA
     box: BoundingBox | None = None
+    indirect: str = "none"
 
 
 @dataclass
