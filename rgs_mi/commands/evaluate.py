@@ -20,8 +20,6 @@ from ..export.mitsuba_scene import SCENE, sensor_id
 from ..fit.curves import Curves
 from ..plugins import lit_surfels
 from ..report import results
-from ..settings.config import completed
-from ..settings.settings import Settings
 from ..shading.environment import Environment
 
 _FACTS = {
@@ -90,8 +88,8 @@ def _keep_lpips(saved, mean, scores):
 
 def _background(saved, run):
     try:
-        background = float(completed(Settings, saved["settings"])["background"])
-    except (AttributeError, TypeError, ValueError):
+        background = float(saved["settings"]["background"])
+    except (KeyError, TypeError, ValueError):
         background = np.nan
     if not 0 <= background <= 1:
         raise UserError(f"{run / results.METRICS}: its settings have no background from 0 to 1: it is damaged")

@@ -17,8 +17,6 @@ from ..fit import checkpoint
 from ..fit.scene import FitScene
 from ..report import results
 from ..report.comparison import DETAILS, FIGURES
-from ..settings.config import completed
-from ..settings.settings import Settings
 from .optimize import optimize
 
 _DIGEST = "photographs.sha256"  # beside or above the fits: what they are of
@@ -45,7 +43,7 @@ class Job:
 
     def has(self, saved: dict) -> bool:
         """Whether the settings ``saved`` with a fit are this job's."""
-        return completed(Settings, saved) == self.settings
+        return saved == self.settings
 
     def figures(self) -> dict | None:
         """metrics.json of the finished fit; None where there is none, or one with other settings."""

@@ -6,8 +6,8 @@ import numpy as np
 _ALIGNMENT = 64  # bytes: an AVX-512 register
 
 
-def as_float(values: np.ndarray):
-    """``values``, flattened, as a ``mi.Float``, in memory aligned as Dr.Jit's own.
+def as_float(values: np.ndarray) -> "mi.Float":
+    """Return ``values`` (any shape) flattened, in single precision, in memory aligned as Dr.Jit's own.
 
     Dr.Jit's LLVM backend uses a NumPy array's memory where it lies and compiles its alignment into the kernels that read it:
     since NumPy's varies from array to array, so would the kernels.
@@ -19,6 +19,6 @@ def as_float(values: np.ndarray):
     return mi.Float(memory[first : first + values.size])
 
 
-def as_tensor(values: np.ndarray):
-    """``values`` as a ``mi.TensorXf``, in memory aligned as Dr.Jit's own; see `as_float`."""
+def as_tensor(values: np.ndarray) -> "mi.TensorXf":
+    """Return ``values`` as a tensor of the same shape, in memory aligned as Dr.Jit's own (see `as_float`)."""
     return mi.TensorXf(as_float(values), np.shape(values))

@@ -6,11 +6,17 @@ the viewing direction, so that depth is z and pixel = focal * (x/z, y/z) + princ
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from .errors import UserError
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 _MITSUBA_TO_CV = np.diag([-1.0, -1.0, 1.0, 1.0])
 
@@ -33,31 +39,36 @@ class Camera:
 
     @property
     def origin(self) -> np.ndarray:
-        """[3] position of the pinhole in world space."""
+        """The position of the pinhole in world space, [3]."""
         return self.to_world[:3, 3]
 
     @property
     def rotation(self) -> np.ndarray:
-        """[3, 3] world-to-camera rotation."""
+        """The world-to-camera rotation, [3, 3]."""
         return self.to_world[:3, :3].T
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """World points [N, 3] to pixels [N, 2] and depths [N] (z; pixels are meaningless where it is not positive)."""
+        """Project world ``points`` [N, 3]; return pixels [N, 2] and depths z [N]. Pixels mean nothing where z ≤ 0."""
         p = (np.asarray(points) - self.origin) @ self.rotation.T
         z = p[:, 2]
         return p[:, :2] / np.where(z == 0, 1e-9, z)[:, None] * self.focal + self.principal, z
 
-    def rays(self) -> np.ndarray:
-        """[H, W, 3] world-space directions through the pixel centres, with unit camera-space z (depth times direction
-        plus origin is the point)."""
+    def image_plane(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return x/z and y/z, each [H, W], of the camera-space rays through the pixel centers."""
         width, height = self.size
         x = (np.arange(width) + 0.5 - self.principal[0]) / self.focal[0]
         y = (np.arange(height) + 0.5 - self.principal[1]) / self.focal[1]
-        d = np.stack([*np.meshgrid(x, y), np.ones((height, width))], -1)
-        return d @ self.rotation
+        x, y = np.meshgrid(x, y)
+        return x, y
+
+    def rays(self) -> np.ndarray:
+        """Return the world-space rays through the pixel centers, [H, W, 3], of unit camera-space z: origin + depth · ray is
+        the point that a pixel shows. `pixel_rays` is the same on Dr.Jit arrays."""
+        x, y = self.image_plane()
+        return np.stack([x, y, np.ones_like(x)], -1) @ self.rotation
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The same camera with another pixel grid over the same image plane."""
+        """Return the same camera with another pixel grid over the same image plane."""
         sx, sy = width / self.size[0], height / self.size[1]
         return replace(
             self,
@@ -67,30 +78,33 @@ class Camera:
         )
 
     def subdivided(self, spp: int) -> tuple["Camera", int]:
-        """The same camera with a pixel for each of ``spp`` samples of a pixel, rounded up to a square, and how many of them
-        lie along its side."""
+        """Return the same camera with a pixel for each of ``spp`` samples of a pixel, rounded up to a square, and how many of
+        them lie along its side."""
         side = math.ceil(math.sqrt(spp))
         return self.resized(*(side * n for n in self.size)), side
 
     def cropped(self, x: int, y: int, width: int, height: int) -> "Camera":
-        """The same camera, restricted to the window of ``width`` × ``height`` pixels whose corner is pixel (x, y)."""
+        """Return the same camera, restricted to the window of ``width`` × ``height`` pixels whose corner is pixel (x, y)."""
         return replace(self, principal=(self.principal[0] - x, self.principal[1] - y), size=(width, height))
 
     @classmethod
-    def look_at(cls, origin, target, up, fov_x: float, size) -> "Camera":
-        """A camera at ``origin`` that looks at ``target``; ``fov_x`` is the horizontal field of view in degrees."""
+    def look_at(
+        cls, origin: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike, fov_x: float, size: tuple[int, int]
+    ) -> "Camera":
+        """Return a camera at ``origin`` that looks at ``target``, both [3] in world space, as is ``up``; ``fov_x`` is the
+        horizontal field of view in degrees, ``size`` (width, height) in pixels."""
         z = np.subtract(target, origin).astype(float)
         z /= np.linalg.norm(z)
-        x = np.cross(z, up)
+        x = np.cross(z, np.asarray(up, float))
         x /= np.linalg.norm(x)
         to_world = np.eye(4)
         to_world[:3] = np.stack([x, np.cross(z, x), z, np.asarray(origin, float)], 1)
         focal = 0.5 * size[0] / np.tan(np.radians(fov_x) / 2)
-        return cls(to_world, (focal, focal), (size[0] / 2, size[1] / 2), tuple(size))
+        return cls(to_world, (focal, focal), (size[0] / 2, size[1] / 2), (size[0], size[1]))
 
     @classmethod
-    def from_sensor(cls, sensor) -> "Camera":
-        """The camera of a Mitsuba `perspective` sensor, over the film's crop window.
+    def from_sensor(cls, sensor: "mi.Sensor") -> "Camera":
+        """Return the camera of a Mitsuba `perspective` sensor, over the film's crop window.
 
         Raises: UserError when the sensor is not a perspective pinhole.
         """
@@ -103,7 +117,7 @@ class Camera:
         crop, offset = np.array(film.crop_size()).ravel(), np.array(film.crop_offset()).ravel()
         scalar = lambda key: float(np.array(params[key]).ravel()[0])
         focal = 0.5 * width / np.tan(np.radians(scalar("x_fov")) / 2)
-        # A positive principal point offset shifts the optical centre by that fraction of the film, see the plugin's docs.
+        # A positive principal point offset shifts the optical center by that fraction of the film, see the plugin's docs.
         principal = (
             width * (0.5 - scalar("principal_point_offset_x")) - offset[0],
             height * (0.5 - scalar("principal_point_offset_y")) - offset[1],
@@ -112,7 +126,8 @@ class Camera:
         return cls(to_world, (focal, focal), principal, (int(crop[0]), int(crop[1])))
 
     def to_sensor_dict(self) -> dict:
-        """A Mitsuba `perspective` sensor (as for ``mi.load_dict``) with this camera's view. Needs square pixels."""
+        """Return a Mitsuba `perspective` sensor (as for ``mi.load_dict``) with this camera's view, whose pixels must be
+        square."""
         import mitsuba as mi
 
         width, height = self.size
@@ -127,8 +142,49 @@ class Camera:
         }
 
 
-def looked_at(cameras) -> tuple[np.ndarray, float]:
-    """The point [3] nearest to all optical axes, and the greatest distance of a camera from it (at least 1e-3)."""
+# ---- On Dr.Jit arrays ----
+
+
+def opaque(camera: Camera) -> tuple["mi.Matrix3f", "mi.Point3f", "mi.Vector2f", "mi.Vector2f"]:
+    """Return the camera's numbers as opaque Dr.Jit values (literals would recompile the kernels at every pose): rotation
+    (world to camera), origin (world space), focal length and principal point (pixels)."""
+    import drjit as dr
+    import mitsuba as mi
+
+    scalar = lambda v: dr.opaque(mi.Float, float(v))
+    return (
+        mi.Matrix3f([[scalar(v) for v in row] for row in camera.rotation]),
+        mi.Point3f(*map(scalar, camera.origin)),
+        mi.Vector2f(*map(scalar, camera.focal)),
+        mi.Vector2f(*map(scalar, camera.principal)),
+    )
+
+
+def pixel_rays(camera: Camera, index: "mi.UInt32") -> "mi.Vector3f":
+    """Return the world-space rays through the centers of the pixels ``index`` (row-major), of unit camera-space z; see
+    `Camera.rays`, their twin on NumPy arrays."""
+    import mitsuba as mi
+
+    R, _, f, principal = opaque(camera)
+    width = camera.size[0]
+    x = (mi.Float(index % width) + 0.5 - principal.x) / f.x
+    y = (mi.Float(index // width) + 0.5 - principal.y) / f.y
+    return R.T @ mi.Vector3f(x, y, 1)
+
+
+def pixel_directions(camera: Camera, index: "mi.UInt32") -> "mi.Vector3f":
+    """Return `pixel_rays` of unit length."""
+    import drjit as dr
+
+    return dr.normalize(pixel_rays(camera, index))
+
+
+# ---- Of several cameras ----
+
+
+def focus_point(cameras: Sequence[Camera]) -> tuple[np.ndarray, float]:
+    """Return the world-space point [3] nearest to all optical axes, in least squares, and the greatest distance of a camera
+    from it (at least 1e-3)."""
     origins = np.stack([c.origin for c in cameras])
     axes = np.stack([c.to_world[:3, 2] for c in cameras])
     away = np.eye(3) - axes[:, :, None] * axes[:, None, :]  # [C, 3, 3] projects onto the plane across each axis

@@ -2,8 +2,10 @@
 
 import errno
 import os
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -12,7 +14,7 @@ from .errors import UserError
 
 
 @contextmanager
-def atomic_file(path):
+def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
     """Open a binary file that replaces ``path`` when the block ends, and leaves it untouched when the block raises.
 
     Raises: UserError where the disk is full or the folder can't be written.
@@ -35,7 +37,7 @@ def atomic_file(path):
             pass  # the folder itself is unusable, which is reported above
 
 
-def make_folder(folder):
+def make_folder(folder: str | Path) -> None:
     """Make a run's folder, so that one that can't be is found before anything is computed for it.
 
     Raises: UserError where it can't be made.
@@ -45,8 +47,8 @@ def make_folder(folder):
 
 
 @contextmanager
-def _explained(path):
-    """What the system says against writing ``path``, as a `UserError`."""
+def _explained(path: str | Path) -> Iterator[None]:
+    """Turn what the system says against writing ``path`` into a `UserError`."""
     try:
         yield
     except OSError as error:
@@ -58,16 +60,22 @@ def _explained(path):
         ) from error
 
 
-def write_png(path, image: np.ndarray):
-    """Write [H, W, 3 or 4] display values in [0, 1] as an 8-bit PNG, whole or not at all."""
+def write_png(path: str | Path, image: np.ndarray) -> None:
+    """Write display values in [0, 1], [H, W, 3 or 4], as an 8-bit PNG, whole or not at all.
+
+    Raises: UserError as `atomic_file` does.
+    """
     from PIL import Image
 
     with atomic_file(path) as stream:
         Image.fromarray(to_8bit(image)).save(stream, "PNG")
 
 
-def write_exr(path, pixels: np.ndarray, channels=None):
-    """Write [H, W, C] as a float32 EXR, whole or not at all; ``channels`` names them (None: RGB)."""
+def write_exr(path: str | Path, pixels: np.ndarray, channels: list[str] | None = None) -> None:
+    """Write ``pixels`` [H, W, C] as a float32 EXR, whole or not at all; ``channels`` names them (None: RGB).
+
+    Raises: UserError as `atomic_file` does.
+    """
     import mitsuba as mi
 
     formats = mi.Bitmap.PixelFormat

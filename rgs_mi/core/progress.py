@@ -26,7 +26,7 @@ class Progress:
     Args:
       total: planned wall-clock seconds, from which the time left follows; None to extrapolate it from the fraction done
              since the first update
-      quiet: show nothing
+      quiet: whether to show nothing
       label: what is going on
     """
 
@@ -36,7 +36,7 @@ class Progress:
         self._live = None
         self._first = None  # time and fraction of the first update
 
-    def __enter__(self):
+    def __enter__(self) -> "Progress":
         self._start = self._printed = time.monotonic()
         console = Console(stderr=True)
         # FORCE_COLOR makes rich take a pipe for a terminal, so the file is asked as well
@@ -45,16 +45,16 @@ class Progress:
             self._live.start()
         return self
 
-    def update(self, fraction: float, **fields):
-        """Set the fraction done, in [0, 1], and what else to tell. ``psnr`` (dB), ``surfels``, ``ms`` (a step) and
-        ``pixels`` have their own words; other fields read 'name value'. A field stays until it is given again."""
+    def update(self, fraction: float, **fields: object) -> None:
+        """Set the fraction done, in [0, 1], and what else to tell. ``psnr`` (dB), ``surfels``, ``ms`` (milliseconds a step)
+        and ``pixels`` have their own words; other fields read 'name value'. A field stays until it is given again."""
         self.fraction = min(max(float(fraction), 0.0), 1.0)
         self._first = self._first or (time.monotonic(), self.fraction)
         self.fields |= fields
         if not self._live and time.monotonic() - self._printed >= PLAIN_INTERVAL:
             self._print()
 
-    def __exit__(self, *_):
+    def __exit__(self, *_) -> None:
         if self._live:
             self._live.stop()
         elif self.fields or self.fraction:

@@ -1,4 +1,4 @@
-"""Finds an LLVM that works, sets Mitsuba's variant: the only module that touches the environment.
+"""Finds an LLVM that works and sets Mitsuba's variant: the only module that touches environment variables.
 
 Dr.Jit's CPU backend loads libLLVM at run time. Version 15 loads and then aborts the process in ``dr.clip``; older ones
 are refused with a misleading message. On Linux x86-64 the wheel ``karellen-llvm-core`` brings a recent one into the
@@ -22,8 +22,8 @@ _REMEDY = (
 )
 
 
-def llvm_version(path) -> int | None:
-    """Major version of the LLVM library at ``path``, or None where it can't be loaded or isn't one."""
+def llvm_version(path: str | Path) -> int | None:
+    """Return the major version of the LLVM library at ``path``, or None where it can't be loaded or isn't one."""
     try:
         library = ctypes.CDLL(str(path))
         numbers = [ctypes.c_uint() for _ in range(3)]
@@ -46,7 +46,7 @@ def _candidates():
         yield name
 
 
-def find_llvm():
+def find_llvm() -> None:
     """Point Dr.Jit at an LLVM of version 16 or later; must run before ``import drjit``.
 
     A path that the user has set is respected. Where no library is found nothing is set: the CUDA variants do not need one,
@@ -60,8 +60,8 @@ def find_llvm():
             return
 
 
-def set_variant(name: str = "llvm_ad_rgb"):
-    """Activate a Mitsuba variant that rgs_mi supports.
+def set_variant(name: str = "llvm_ad_rgb") -> None:
+    """Activate the Mitsuba variant ``name``, one of `VARIANTS`.
 
     Raises: UserError for an unknown variant, a missing or too old LLVM, or a machine without the backend.
     """

@@ -8,8 +8,8 @@ import mitsuba as mi
 from .errors import UserError
 
 
-def load_scene(path, variables: dict):
-    """``mi.load_file``; ``variables``: the scene's ``<default>``s to override. Needs an active variant.
+def load_scene(path: str | Path, variables: dict[str, object]) -> "mi.Scene":
+    """Load a scene file; ``variables`` override the scene's ``<default>``s. A variant must be active.
 
     Raises: UserError, in one line, for whatever is wrong with the scene.
     """
@@ -27,6 +27,6 @@ def load_scene(path, variables: dict):
         raise UserError(f"cannot load {path}: {text}") from error
 
 
-def spp_of(scene) -> int:
-    """Samples per pixel that the scene's first sensor asks for."""
+def spp_of(scene: "mi.Scene") -> int:
+    """Return the samples per pixel that the scene's first sensor asks for."""
     return scene.sensors()[0].sampler().sample_count()

@@ -5,7 +5,9 @@ import os
 import signal
 import threading
 import traceback
+from collections.abc import Callable, Iterable, Iterator
 from multiprocessing.connection import wait
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,9 +16,9 @@ from .errors import UserError, run_main
 from .runtime import set_variant
 
 
-def apart(function, *arguments):
-    """``function(*arguments)`` in a process of its own, under the same Mitsuba variant; pickle must take all of it. SIGTERM
-    tells that process to stop (see `GracefulInterrupt`) when Ctrl-C is pressed here, or when this process dies.
+def apart(function: Callable, *arguments: object) -> Any:
+    """Return ``function(*arguments)``, called in a process of its own under the same Mitsuba variant; pickle must take all of
+    it. SIGTERM tells that process to stop (see `GracefulInterrupt`) when Ctrl-C is pressed here, or when this process dies.
 
     Raises: UserError, in one line, for whatever goes wrong there, a crash or kill included; KeyboardInterrupt after Ctrl-C,
     when the process has ended. Pressing again kills it.
@@ -27,8 +29,11 @@ def apart(function, *arguments):
     return value
 
 
-def each_apart(function, calls, workers=1):
-    """`apart` for each of ``calls``, tuples of arguments, up to ``workers`` at a time, among which the cores are divided.
+def each_apart(
+    function: Callable, calls: Iterable[tuple], workers: int = 1
+) -> Iterator[tuple[tuple, Any, UserError | None]]:
+    """Call ``function`` as `apart` does for each of ``calls``, tuples of arguments, up to ``workers`` at a time, among which
+    the cores are divided.
 
     Yields: (arguments, value, None) or (arguments, None, UserError), as they end.
     Raises: KeyboardInterrupt after Ctrl-C, when all have ended.
@@ -55,9 +60,9 @@ def each_apart(function, calls, workers=1):
             call.process.kill()
 
 
-def _cores():
-    """Those that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+def _cores() -> int:
+    """The number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class _Call:
@@ -83,6 +88,7 @@ class _Call:
             value, error = None, None
         self.process.join()
         code = self.process.exitcode
+        assert code is not None, "it has been joined"
         if code < 0:
             hint = ", perhaps for want of memory" if code == -signal.SIGKILL else ""
             error = f"killed by {signal.Signals(-code).name}{hint}"
@@ -112,5 +118,7 @@ def _work(send, variant, threads, function, arguments):
 
 
 def _end_with_parent():
-    multiprocessing.parent_process().join()
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "this runs in a process that `_Call` started"
+    parent.join()
     os.kill(os.getpid(), signal.SIGTERM)

@@ -8,20 +8,22 @@ import io
 import pickle
 from collections import OrderedDict
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from .errors import UserError
 
 
-def load(source):
-    """What the pickle ``source`` (a path or a binary stream) holds: containers, numbers, text and NumPy arrays of numbers.
+def load(source: str | Path | BinaryIO) -> Any:
+    """Return what the pickle ``source`` (a path or a binary stream) holds: containers, numbers, text and NumPy arrays of
+    numbers.
 
     Raises: UserError for a file that is missing, damaged or holds anything else.
     """
     name = getattr(source, "name", source)
     try:
-        data = source.read() if hasattr(source, "read") else Path(source).read_bytes()
+        data = Path(source).read_bytes() if isinstance(source, str | Path) else source.read()
         return _Unpickler(io.BytesIO(data)).load()
     except OSError as error:
         raise UserError(f"{name}: can't be read ({error.strerror or error}): check the path") from None
@@ -71,17 +73,19 @@ for _core in ("numpy.core", "numpy._core"):  # before NumPy 2, and since
 
 
 class _Unpickler(pickle._Unpickler):  # the one in Python: a damaged number makes that in C fill the memory
-    def find_class(self, module, name):
+    stack: list  # which typeshed does not declare, nor `load_build`
+
+    def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _ADMITTED:
             raise pickle.UnpicklingError(f"it names {module}.{name}")
         return _ADMITTED[module, name]
 
-    def load_build(self):
+    def load_build(self) -> None:
         """Give an object its state: an array, or a type of numbers or text, whose state is no more than the byte order."""
         *_, target, state = self.stack
         plain = isinstance(target, np.dtype) and state[2:] == target.__reduce__()[2][2:]  # of text: its length, which stays
         if not (plain or isinstance(target, np.ndarray)):
             raise pickle.UnpicklingError(f"it sets the state of a {type(target).__name__}")
-        super().load_build()
+        super().load_build()  # type: ignore[misc]  # typeshed has none
 
-    dispatch = pickle._Unpickler.dispatch | {pickle.BUILD[0]: load_build}
+    dispatch: dict = pickle._Unpickler.dispatch | {pickle.BUILD[0]: load_build}

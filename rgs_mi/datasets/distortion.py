@@ -107,10 +107,7 @@ def _load(path, pixels):
 
 def _resample(pixels, camera, distortion):
     height, width = pixels.shape[:2]
-    x, y = np.meshgrid(
-        (np.arange(width) + 0.5 - camera.principal[0]) / camera.focal[0],
-        (np.arange(height) + 0.5 - camera.principal[1]) / camera.focal[1],
-    )
+    x, y = camera.image_plane()
     with np.errstate(over="ignore", invalid="ignore"):
         x, y = distortion.apply(x, y)
         column, row = x * camera.focal[0] + camera.principal[0], y * camera.focal[1] + camera.principal[1]

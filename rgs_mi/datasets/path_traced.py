@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..core.camera import Camera
+from ..core.camera import Camera, opaque, pixel_directions
 from ..core.errors import UserError
 from ..core.progress import Progress
 from ..core.scene_files import load_scene
@@ -129,18 +129,16 @@ class Renderer:
         import mitsuba as mi
 
         (width, height), n = camera.size, AOV_GRID
+        fine, _ = camera.subdivided(n * n)
         index = dr.arange(mi.UInt32, width * height * n * n)
         pixel, sub = index // (n * n), index % (n * n)
-        x = (pixel % width + (sub % n + 0.5) / n - camera.principal[0]) / camera.focal[0]
-        y = (pixel // width + (sub // n + 0.5) / n - camera.principal[1]) / camera.focal[1]
-        to_world = mi.Matrix3f(camera.to_world[:3, :3].tolist())
-        origin = mi.Point3f(*camera.origin.tolist())
-        dr.make_opaque(to_world, origin)
-        ray = mi.Ray3f(origin, dr.normalize(to_world @ mi.Vector3f(x, y, 1)))
+        column, row = pixel % width * n + sub % n, pixel // width * n + sub // n
+        rotation, origin, *_ = opaque(camera)
+        ray = mi.Ray3f(origin, pixel_directions(fine, row * (n * width) + column))
         si = self.scene.ray_intersect(ray)
         hit, bsdf = si.is_valid(), si.bsdf(ray)
         normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n)
-        depth = si.t * dr.dot(to_world @ mi.Vector3f(0, 0, 1), ray.d)
+        depth = si.t * (rotation @ ray.d).z
         albedo = bsdf.eval_diffuse_reflectance(si, hit)
         scalars = [
             dr.select(bsdf.has_attribute(k, hit), bsdf.eval_attribute_1(k, si, hit), 0) for k in ("roughness", "metallic")

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from ..core.camera import Camera, looked_at
+from ..core.camera import Camera, focus_point
 from ..core.color import srgb_encode
 from ..core.errors import UserError
 from ..core.files import write_exr, write_png
@@ -173,7 +173,7 @@ def _along(scene, path, frames):
         return dict(zip([sensor.id() for sensor in scene.sensors()], cameras))
     if len(cameras) < 2:
         raise UserError(f"{path}: has one sensor, which is no path: use --turntable")
-    center, _ = looked_at(cameras)
+    center, _ = focus_point(cameras)
     knots, times = np.arange(len(cameras)), np.linspace(0, len(cameras) - 1, frames)
     through = lambda values: PchipInterpolator(knots, values)(times)
     rotations = RotationSpline(knots, Rotation.from_matrix([c.to_world[:3, :3] for c in cameras]))(times).as_matrix()

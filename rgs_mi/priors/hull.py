@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage, spatial, special
 
-from ..core.camera import looked_at
+from ..core.camera import focus_point, opaque, pixel_rays
 from ..core.errors import UserError
 
 _EDGE_SIGMA = 0.6  # pixels; small enough that lines one pixel wide stay above one half
@@ -176,7 +176,7 @@ def object_box(views) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _object_box(silhouettes):
-    center, reach = looked_at([s.camera for s in silhouettes])
+    center, reach = focus_point([s.camera for s in silhouettes])
     lower, upper = center - reach, center + reach
     for _ in range(8):
         step = (upper - lower).max() / 40
@@ -321,13 +321,8 @@ def depth_maps(vertices, faces, cameras) -> list[np.ndarray]:
     depths = []
     for camera in cameras:
         width, height = camera.size
-        # Opaque, or every pose would be compiled into a kernel of its own.
-        number = lambda x: dr.opaque(mi.Float, float(x))
-        pixel = dr.arange(mi.UInt32, width * height)
-        x = (mi.Float(pixel % width) + 0.5 - number(camera.principal[0])) / number(camera.focal[0])
-        y = (mi.Float(pixel // width) + 0.5 - number(camera.principal[1])) / number(camera.focal[1])
-        right, down, forward, origin = (mi.Vector3f(*map(number, camera.to_world[:3, k])) for k in range(4))
-        ray = mi.Ray3f(mi.Point3f(origin), right * x + down * y + forward)  # unit z: the ray parameter is the depth
+        rays = pixel_rays(camera, dr.arange(mi.UInt32, width * height))
+        ray = mi.Ray3f(opaque(camera)[1], rays)  # unit z: the ray parameter is the depth
         t = np.array(scene.ray_intersect_preliminary(ray, coherent=True).t).reshape(height, width)
         depths.append(np.where(np.isfinite(t), t, np.float32(np.nan)))
     return depths

@@ -3,6 +3,7 @@
 import numpy as np
 from scipy import spatial
 
+from ..core.camera import focus_point
 from ..core.color import srgb_decode
 from ..datasets.types import Dataset
 from . import hull, stereo
@@ -36,7 +37,7 @@ def initial_points(
         if dataset.point_colors is not None:
             return positions, None, np.asarray(dataset.point_colors, np.float32)[chosen], _spacing(positions)
     else:
-        center, reach = hull.looked_at([view.camera for view in views])
+        center, reach = focus_point([view.camera for view in views])
         # Half a frame's extent at the centre, for the typical camera: inside that ball all of them see something.
         half = np.median([min(v.camera.size[k] / v.camera.focal[k] for k in (0, 1)) / 2 for v in views])
         ball = rng.normal(size=(count, 3))
@@ -48,7 +49,7 @@ def initial_points(
 def surroundings(dataset: Dataset, count: int, seed: int = 0):
     """Points far away for what lies behind an object without a mask: on a sphere about it, `_FAR` times as far as the
     cameras. Returns: as `initial_points`; the normals point inwards."""
-    center, reach = hull.looked_at([view.camera for view in dataset.train])
+    center, reach = focus_point([view.camera for view in dataset.train])
     outward = np.random.default_rng((seed, 1)).normal(size=(count, 3))
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     positions = (center + _FAR * reach * outward).astype(np.float32)

@@ -16,8 +16,8 @@ import numpy as np
 from scipy import ndimage
 
 from ..core.arrays import as_float
+from ..core.camera import opaque, pixel_rays
 from ..core.progress import Progress
-from ..splat.project import opaque
 from . import hull
 
 _WIDTH = 200  # pixels of a photograph's copy at most
@@ -127,8 +127,7 @@ def _points(camera, depth, level):
     entry, n = dr.arange(mi.UInt32, filled.size * len(level)), dr.opaque(mi.UInt32, filled.size)
     pixel = entry % n
     z = dr.gather(mi.Float, as_float(filled), pixel) + dr.gather(mi.Float, as_float(level), entry // n)
-    rays = mi.Vector3f(*(dr.gather(mi.Float, as_float(c), pixel) for c in np.moveaxis(camera.rays(), -1, 0)))
-    point = opaque(camera)[1] + rays * z
+    point = opaque(camera)[1] + pixel_rays(camera, pixel) * z
     dr.eval(point)
     return point
 

@@ -4,6 +4,7 @@ Texel column c lies at longitude 2π (c + 1/2)/W, row r at colatitude π r/(H �
 A direction d in the emitter's frame has longitude atan2(d_x, −d_z) and colatitude acos(d_y).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -14,26 +15,32 @@ from ..core.errors import UserError
 from ..splat.hit import adding
 from . import prefilter as _prefilter
 
+#: Callback ``(radiance, direction, index)`` that returns incident radiance after occlusion along the world-space unit
+#: ``direction`` at the surfaces ``index`` (None: one direction for each surface), where the unoccluded environment has
+#: ``radiance``.
+IncidentRadiance = Callable[["mi.Color3f", "mi.Vector3f", "mi.UInt32 | None"], "mi.Color3f"]
+
 
 @dataclass
 class Environment:
     """A learned or loaded environment.
 
-    texels:   ``mi.TensorXf`` [rows, columns, 3], linear radiance (scale included), without the emitter's halo columns
-    rotation: [3, 3] emitter frame to world frame
+    texels    [rows, columns, 3], linear radiance (scale included), without the emitter's halo columns
+    rotation  [3, 3] emitter frame to world frame
     """
 
     texels: "mi.TensorXf"
     rotation: np.ndarray
 
     @property
-    def size(self):
+    def size(self) -> tuple[int, int]:
+        """Rows and columns of texels."""
         return self.texels.shape[:2]
 
     @classmethod
-    def from_emitter(cls, emitter) -> "Environment":
-        """From a Mitsuba `envmap` (gradients of its ``data`` and ``scale`` are kept) or `constant` emitter (of its
-        ``radiance``), which becomes a small map.
+    def from_emitter(cls, emitter: "mi.Emitter") -> "Environment":
+        """Take the radiance of a Mitsuba `envmap` (gradients of its ``data`` and ``scale`` are kept) or of a `constant`
+        emitter (those of its ``radiance``), which becomes a small map.
 
         Raises: UserError for another kind of emitter.
         """
@@ -47,31 +54,31 @@ class Environment:
         rotation = np.array(params["to_world"].matrix, np.float64).reshape(4, 4)[:3, :3]
         return cls(texels, rotation)
 
-    def to_local(self, d):
-        """World-space directions in the emitter's frame."""
+    def to_local(self, d: "mi.Vector3f") -> "mi.Vector3f":
+        """Turn world-space directions into the emitter's frame."""
         inverse = np.linalg.inv(self.rotation)
         return mi.Matrix3f([[dr.opaque(mi.Float, float(v)) for v in row] for row in inverse]) @ d
 
     def filtered(self) -> "FilteredEnvironment":
-        """The environment convolved with the BSDF's lobe at every roughness level."""
+        """Return the environment convolved with the BSDF's lobe at every level of roughness (docs/method.md §3)."""
         operator = _prefilter.prefilter(*self.size, mi.variant())
         return FilteredEnvironment(_prefilter.apply(self.texels.array, operator), operator, self)
 
     def unfiltered(self) -> "FilteredEnvironment":
-        """The environment itself, for lookups: the level of roughness 0 alone."""
+        """Return the environment itself, for lookups: the level of roughness 0 alone."""
         mirror = _prefilter.Prefilter(self.size, (self.size,), ())
         return FilteredEnvironment(_prefilter.apply(self.texels.array, mirror), mirror, self)
 
     def finer(self) -> "Environment":
-        """The same on twice as many rows and columns."""
+        """Return the same environment, interpolated, on twice as many rows and columns."""
         rows, columns = (2 * size for size in self.size)
         index = dr.arange(mi.UInt32, rows * columns)
         longitude = (mi.Float(index % columns) + 0.5) / columns
         radiance = self.unfiltered()._level(longitude, mi.Float(index // columns) / (rows - 1), mi.UInt32(0))
         return Environment(mi.TensorXf(dr.ravel(radiance), (rows, columns, 3)), self.rotation)
 
-    def emitter(self):
-        """Mitsuba's own `envmap` of the same radiance, for its sampling."""
+    def emitter(self) -> "mi.Emitter":
+        """Return Mitsuba's own `envmap` of the same radiance, for its sampling; not differentiable."""
         to_world = np.eye(4)
         to_world[:3, :3] = self.rotation
         emitter = {
@@ -84,14 +91,15 @@ class Environment:
 
 @dataclass
 class FilteredEnvironment:
-    """``texels``: all levels of `Prefilter`, padded to four floats a texel."""
+    """An ``environment`` filtered by an ``operator``: ``texels`` are the maps of all its levels, padded to four floats a
+    texel."""
 
     texels: "mi.Float"
     operator: _prefilter.Prefilter
     environment: Environment
 
     def _level(self, longitude, colatitude, level):
-        """Bilinear lookup in map number ``level`` (one a lane); longitude and colatitude in [0, 1]."""
+        """Bilinear lookup in the map ``level`` (``mi.UInt32``); longitude and colatitude in [0, 1]."""
         # from lists: a NumPy array's memory is not aligned (see `core.arrays`), and one of a single number is read, not gathered
         constant = lambda values: dr.gather(mi.UInt32, mi.UInt32([int(v) for v in values]), level)
         rows, columns = (constant([size[i] for size in self.operator.maps]) for i in (0, 1))
@@ -121,8 +129,9 @@ class FilteredEnvironment:
         colatitude = dr.atan2(dr.sqrt(horizontal), d.y) / dr.pi
         return longitude, colatitude
 
-    def eval(self, direction, roughness=None):
-        """Radiance along world-space unit ``direction``, averaged over the lobe of ``roughness``; None: unfiltered."""
+    def eval(self, direction: "mi.Vector3f", roughness: "mi.Float | None" = None) -> "mi.Color3f":
+        """Return linear radiance along world-space unit ``direction``, averaged over the lobe of ``roughness`` (None:
+        unfiltered)."""
         longitude, colatitude = self._coordinates(direction)
         if roughness is None:
             return self._level(longitude, colatitude, mi.UInt32(0))
@@ -137,6 +146,6 @@ class FilteredEnvironment:
             position - mi.Float(level),
         )
 
-    def eval_diffuse(self, normal):
-        """Radiance averaged over the cosine lobe around world-space unit ``normal``: irradiance by π."""
+    def eval_diffuse(self, normal: "mi.Vector3f") -> "mi.Color3f":
+        """Return radiance averaged over the cosine lobe around world-space unit ``normal``: irradiance by π."""
         return self._level(*self._coordinates(normal), mi.UInt32(len(_prefilter.LEVELS)))

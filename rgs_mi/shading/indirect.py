@@ -1,49 +1,71 @@
-"""The object reflected in itself: what a pixel reflects is traced, by Mitsuba's ray tracer, through the surfels as quads.
+"""The object reflected in itself (docs/method.md §3): what a pixel reflects is traced, by Mitsuba's ray tracer, through the
+surfels as quads.
 
 Where the reflected ray meets a surfel, the light that comes along it is that surfel's own radiance, diffuse and specular
 (`one_bounce`), or nothing (`visibility`), instead of the environment. The hit itself is piecewise constant in what moves it:
 gradients flow into the radiance of what is hit and its direction, not into which surfel is hit. One ray says little about
 the wide lobe of a rough surface: where that has a radiance of its own, which carries such light blurred, no ray is traced.
 
-A diffuse lobe has no one direction to trace. Of it each surfel knows how much of the light L that the environment has for it
+A diffuse lobe has no one direction to trace. For it each surfel knows how much of the light L that the environment has for it
 the others let through, or send in its place:
 
     a = ∫ L_s(ω) max(0, n·ω) dω / ∫ L(ω) max(0, n·ω) dω                                                              (9)
 
-by rays that start from its centre, one number a channel. It is splatted as a radiance is, and a pixel's lit diffuse radiance
+by rays that start from its center, one number per channel. It is splatted as a radiance is, and a pixel's lit diffuse radiance
 multiplied by it. Both integrals take the same rays, so that a is 1, free of noise, wherever nothing is met.
 """
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
 
 import drjit as dr
 import mitsuba as mi
 
+from ..core.bounding_box import BoundingBox
 from ..surfels.proxies import Proxies
 from ..surfels.surfels import SH_0, Surfels
 from .sequence import points
 
+if TYPE_CHECKING:
+    from .deferred import Lighting
+
 KINDS = ("none", "visibility", "one_bounce")
-_RAYS = 32  # a surfel, of (9)
+_RAYS = 32  # from each surfel, of (9)
 _BLUR = 0.5  # the roughness as whose lobe sees it the environment is taken there: few rays then see small lights, too
 
 
 @dataclass
 class Indirect:
-    """How surfels see each other: ``kind``, `visibility` or `one_bounce`; ``proxies``, perhaps of a few steps ago; the
-    ``surfels`` as they are; and their ``irradiance_visibility`` of diffuse light, a of (9) (None: all)."""
+    """How surfels see each other.
 
-    kind: str
+    kind                   what a ray brings from a surfel that it meets: nothing, or that surfel's radiance
+    proxies                the quads that rays meet, perhaps of a few steps ago
+    surfels                the surfels as they are
+    irradiance_visibility  a of (9), one entry per surfel (None: 1 for all)
+    """
+
+    kind: Literal["visibility", "one_bounce"]
     proxies: Proxies
     surfels: Surfels
     irradiance_visibility: "mi.Color3f | None" = None
 
-    def incident_radiance(self, incoming, point, normal, direction, lighting, part=1):
-        """``incoming`` radiance along ``direction``, a lane a pixel, where nothing stands in the way; elsewhere the surfels'
-        takes the place of a ``part`` of it."""
+    def incident_radiance(
+        self,
+        incoming: "mi.Color3f",
+        point: "mi.Point3f",
+        normal: "mi.Vector3f",
+        direction: "mi.Vector3f",
+        lighting: "Lighting",
+        part: "mi.Float | float" = 1,
+    ) -> "mi.Color3f":
+        """Return ``incoming``, the environment's radiance along ``direction``, where nothing stands in the way of rays from
+        ``point``, a surface with ``normal`` (unit, world space); elsewhere the radiance of the surfels that rays meet, under
+        ``lighting``, takes the place of a ``part`` of it."""
         part = mi.Float(part)
         dr.eval(incoming, point, normal, direction, part)
-        found, index, uv = self.proxies.intersect(*(dr.detach(v) for v in (point, normal, direction)), dr.detach(part) > 0)
+        found, index, uv = self.proxies.intersect(
+            dr.detach(point), dr.detach(normal), dr.detach(direction), dr.detach(part) > 0
+        )
         indices = dr.compress(found)
         light = dr.zeros(mi.Color3f, dr.width(found))
         if self.kind == "one_bounce" and dr.width(indices) > 0:
@@ -52,9 +74,9 @@ class Indirect:
             dr.scatter(light, self._radiance(index, uv, d, lighting), indices)
         return dr.select(found, dr.lerp(incoming, light, part), incoming)
 
-    def with_irradiance_visibility(self, lighting, seed) -> "Indirect":
-        """The same with `irradiance_visibility`, where surfels are lit by ``lighting``, whose estimator is the split sum;
-        ``seed``: ``mi.UInt32``."""
+    def with_irradiance_visibility(self, lighting: "Lighting", seed: "mi.UInt32") -> "Indirect":
+        """Return the same with `irradiance_visibility`, where surfels are lit by ``lighting``, whose estimator is the split
+        sum; not differentiated."""
         with dr.suspend_grad():
             ratio, normal = self._irradiance_visibility, self.surfels.normals()
             visibility = ratio(normal, lighting, seed)
@@ -76,13 +98,16 @@ class Indirect:
         total = lambda color: mi.Color3f(*(dr.block_sum(c, _RAYS) for c in color))
         return total(coming) / dr.maximum(total(radiance), 1e-6)
 
-    def with_visibility_as_radiance(self, surfels, box) -> Surfels:
-        """``surfels`` whose radiance is their `irradiance_visibility`, in the ``box`` (None: everywhere), to be splatted."""
+    def with_visibility_as_radiance(self, surfels: Surfels, box: BoundingBox | None) -> Surfels:
+        """Return ``surfels`` whose radiance is their `irradiance_visibility`, in the ``box`` (None: everywhere), to be
+        splatted. That must be known."""
+        visibility = self.irradiance_visibility
+        assert visibility is not None, "with_irradiance_visibility() comes first"
         shape = surfels.sh.shape
         sh, row = dr.copy(surfels.sh.array), dr.arange(mi.UInt32, len(surfels)) * shape[1]
         inside = mi.Bool(True) if box is None else box.contains(surfels.column(mi.Point3f, "centers"))
         for k in range(shape[1]):
-            dr.scatter(sh, (self.irradiance_visibility[k] - 0.5) / SH_0 if k < 3 else mi.Float(0), row + k, inside)
+            dr.scatter(sh, (visibility[k] - 0.5) / SH_0 if k < 3 else mi.Float(0), row + k, inside)
         return replace(surfels, sh=mi.TensorXf(sh, shape))
 
     def _radiance(self, index, uv, direction, lighting):

@@ -14,49 +14,72 @@ lobe is narrow, and since p_b + p_l depends on a sample only through its directi
 
 import contextlib
 import functools
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
-from .environment import FilteredEnvironment
+from .environment import FilteredEnvironment, IncidentRadiance
 from .sequence import points
 
-SAMPLES = 16  # a pixel, unless someone says otherwise
+SAMPLES = 16  # per pixel, unless someone says otherwise
 _WAVEFRONT = 1 << 22  # samples at a time
 _OTHER, _DEEPER, _DIFFUSE = 0x9E3779B9, 0x85EBCA6B, 0xC2B2AE35  # what makes of a seed another
 
 
 @dataclass
 class MonteCarlo:
-    """``environment``: radiance, unfiltered. ``emitter``: Mitsuba's, whose sampling is used; it may be of a few steps ago,
-    which costs variance and no bias. ``eta``: index of refraction. ``samples``: S of (7). ``seed``: ``mi.UInt32``.
-    ``paired``: the derivatives are those of another, independent estimate than the value, as losses need that are not linear
-    in it.
+    """The estimator (7).
+
+    environment  radiance, unfiltered
+    emitter      Mitsuba's, whose sampling is used; it may be of a few steps ago, which costs variance and no bias
+    eta          index of refraction
+    samples      S of (7)
+    seed         of the random numbers
+    paired       whether the derivatives are those of another, independent estimate than the value, as losses need that are
+                 not linear in it
     """
 
     environment: FilteredEnvironment
-    emitter: object
+    emitter: "mi.Emitter"
     eta: float
     samples: int
     seed: "mi.UInt32"
     paired: bool = False
 
-    def specular(self, normal, view, roughness, metallic, base_color, incident_radiance=None):
-        """C_s of (7), ``mi.Color3f``; see `SplitSum.specular`."""
+    def specular(
+        self,
+        normal: "mi.Vector3f",
+        view: "mi.Vector3f",
+        roughness: "mi.Float",
+        metallic: "mi.Float",
+        base_color: "mi.Color3f",
+        incident_radiance: IncidentRadiance | None = None,
+    ) -> "mi.Color3f":
+        """Return C_s of (7); see `SplitSum.specular`."""
         return self._integral(SpecularLobe, normal, view, roughness, metallic, base_color, incident_radiance)
 
-    def diffuse(self, normal, view, roughness, metallic, base_color, incident_radiance=None, irradiance_visibility=None):
-        """C_d of (7), ``mi.Color3f``, where ``incident_radiance`` counts, too; ``irradiance_visibility`` is not needed."""
+    def diffuse(
+        self,
+        normal: "mi.Vector3f",
+        view: "mi.Vector3f",
+        roughness: "mi.Float",
+        metallic: "mi.Float",
+        base_color: "mi.Color3f",
+        incident_radiance: IncidentRadiance | None = None,
+        irradiance_visibility: "mi.Color3f | float | None" = None,
+    ) -> "mi.Color3f":
+        """Return C_d of (7), to which ``incident_radiance`` applies, too; ``irradiance_visibility`` is not needed."""
         other = replace(self, seed=self.seed ^ _DIFFUSE)
         return other._integral(DiffuseLobe, normal, view, roughness, metallic, base_color, incident_radiance)
 
     def for_secondary_bounce(self) -> "MonteCarlo":
-        """The estimator of what a reflected ray meets: one sample is enough of what few rays see."""
+        """Return the estimator of what a reflected ray meets: one sample is enough of what few rays see."""
         return replace(self, samples=1, seed=self.seed ^ _DEEPER, paired=False)
 
-    def with_texels(self, texels) -> "MonteCarlo":
-        """The same with other ``texels`` of the environment."""
+    def with_texels(self, texels: "mi.Float") -> "MonteCarlo":
+        """Return the same estimator with other ``texels`` of its `FilteredEnvironment`."""
         return replace(self, environment=replace(self.environment, texels=texels))
 
     def _integral(self, lobe, *surfaces):
@@ -73,15 +96,15 @@ class MonteCarlo:
         return total / self.samples
 
     def _sum(self, lobe, first, count, normal, view, roughness, metallic, base_color, incident_radiance):
-        """Samples number ``first`` to ``first + count`` of (7), added."""
+        """The sum of the samples ``first`` to ``first + count`` of (7)."""
         n = dr.width(normal)
         index = dr.arange(mi.UInt32, n * count)
-        pixel, number = index // count, index % count + dr.opaque(mi.UInt32, first)
+        pixel, sample = index // count, index % count + dr.opaque(mi.UInt32, first)
         dr.eval(normal, view, roughness, metallic, base_color)
         normal, view, roughness, metallic, base_color = _spread((normal, view, roughness, metallic, base_color), count)
         material = lobe(roughness, metallic, base_color, self.eta)
         si = _interaction(normal, view)
-        of_light, of_lobe = points(n, self.seed, pixel, number, sets=2)
+        of_light, of_lobe = points(n, self.seed, pixel, sample, sets=2)
         lit = self.emitter.sample_direction(si, of_light)[0].d
         bounced = si.to_world(material.sample(si, mi.Float(0.5), of_lobe))
         total = mi.Color3f(0)
@@ -105,7 +128,7 @@ class MonteCarlo:
 @functools.lru_cache(maxsize=4)
 def _materials(eta: float, variant: str):
     """Principled BSDFs that are black (a dielectric), metallic, and plastic, and the textures of the latter two: their
-    roughness, a lane each, and their base colour."""
+    roughness and their base colour, one entry per surface."""
     roughness, color = mi.load_dict({"type": "wavefront"}), mi.load_dict({"type": "wavefront", "channels": 3})
     bsdf = lambda metallic, base_color: mi.load_dict(
         {"type": "principled", "eta": eta, "metallic": metallic, "base_color": base_color, "roughness": roughness}
@@ -114,16 +137,16 @@ def _materials(eta: float, variant: str):
 
 
 class _Lobe:
-    """Part of a principled BSDF, a material a lane: `eval` gives f |n·ω_i| for local directions; `sample`, from a random
-    number and a point, and `pdf` choose them."""
+    """Part of a principled BSDF, one material per surface interaction, as Mitsuba's BSDFs have it in local coordinates:
+    `eval` returns f |n·ω_i|, `sample` directions from uniform numbers, and `pdf` their density."""
 
-    def __init__(self, roughness, metallic, base_color, eta):
+    def __init__(self, roughness: "mi.Float", metallic: "mi.Float", base_color: "mi.Color3f", eta: float):
         self.roughness, self.metallic, self.base_color, self.eta = roughness, metallic, base_color, eta
         self.context = mi.BSDFContext()
 
     @contextlib.contextmanager
-    def plugins(self):
-        """Mitsuba's BSDFs, black, metallic and plastic, with these materials for as long as the context lasts: others find
+    def plugins(self) -> Iterator[list]:
+        """Give Mitsuba's BSDFs, black, metallic and plastic, these materials for as long as the context lasts: others find
         constants in them, which any kernel takes."""
         *bsdfs, roughness, color = _materials(self.eta, mi.variant())
         before = roughness.values, color.values
@@ -135,45 +158,47 @@ class _Lobe:
 
 
 class SpecularLobe(_Lobe):
-    """The metal's lobe is sampled; the dielectric's is as wide."""
+    """The specular part, of which the metal's lobe is sampled; the dielectric's is as wide."""
 
-    def eval(self, si, local):
+    def eval(self, si: "mi.SurfaceInteraction3f", local: "mi.Vector3f") -> "mi.Color3f":
         with self.plugins() as (black, metal, _):
             return dr.lerp(black.eval(self.context, si, local), metal.eval(self.context, si, local), self.metallic)
 
-    def pdf(self, si, local):
+    def pdf(self, si: "mi.SurfaceInteraction3f", local: "mi.Vector3f") -> "mi.Float":
         with self.plugins() as (_, metal, _):
             return metal.pdf(self.context, si, local)
 
-    def sample(self, si, choice, point):
+    def sample(self, si: "mi.SurfaceInteraction3f", choice: "mi.Float", point: "mi.Point2f") -> "mi.Vector3f":
         with self.plugins() as (_, metal, _):
             return metal.sample(self.context, si, choice, point)[0].wo
 
 
 class DiffuseLobe(_Lobe):
-    def eval(self, si, local):
+    """The diffuse part, of which cosine-weighted directions are sampled."""
+
+    def eval(self, si: "mi.SurfaceInteraction3f", local: "mi.Vector3f") -> "mi.Color3f":
         with self.plugins() as (black, _, plastic):
             return (1 - self.metallic) * (plastic.eval(self.context, si, local) - black.eval(self.context, si, local))
 
-    def pdf(self, si, local):
+    def pdf(self, si: "mi.SurfaceInteraction3f", local: "mi.Vector3f") -> "mi.Float":
         return mi.warp.square_to_cosine_hemisphere_pdf(local)
 
-    def sample(self, si, choice, point):
+    def sample(self, si: "mi.SurfaceInteraction3f", choice: "mi.Float", point: "mi.Point2f") -> "mi.Vector3f":
         return mi.warp.square_to_cosine_hemisphere(point)
 
 
 class WholeLobe(_Lobe):
-    """Both together: the principled BSDF itself, a mixture of metal and plastic."""
+    """Both parts together: the principled BSDF itself, a mixture of metal and plastic."""
 
-    def eval(self, si, local):
+    def eval(self, si: "mi.SurfaceInteraction3f", local: "mi.Vector3f") -> "mi.Color3f":
         with self.plugins() as (_, metal, plastic):
             return dr.lerp(plastic.eval(self.context, si, local), metal.eval(self.context, si, local), self.metallic)
 
-    def pdf(self, si, local):
+    def pdf(self, si: "mi.SurfaceInteraction3f", local: "mi.Vector3f") -> "mi.Float":
         with self.plugins() as (_, metal, plastic):
             return dr.lerp(plastic.pdf(self.context, si, local), metal.pdf(self.context, si, local), self.metallic)
 
-    def sample(self, si, choice, point):
+    def sample(self, si: "mi.SurfaceInteraction3f", choice: "mi.Float", point: "mi.Point2f") -> "mi.Vector3f":
         of_metal = choice < self.metallic
         choice = dr.select(of_metal, choice / self.metallic, (choice - self.metallic) / (1 - self.metallic))
         with self.plugins() as (_, metal, plastic):

@@ -7,7 +7,7 @@ small real matrix per longitudinal frequency m:
     P̂_m = M_m L̂_m,   M_m[i, j] = ∫∫ K(γ(θ_i, θ, Δφ)) hat_j(θ) sinθ cos(mΔφ) dθ dΔφ · sinc²           (5)
 
 with K the principled BSDF's lobe (`tables.lobe`), γ the angle between the directions, and hats because Mitsuba's
-`envmap` interpolates bilinearly. Rows are normalised: a constant environment stays constant. The poles are
+`envmap` interpolates bilinearly. Rows are normalized: a constant environment stays constant. The poles are
 exact, and the adjoint is the transpose of (5).
 """
 
@@ -15,6 +15,7 @@ import functools
 from dataclasses import dataclass
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from scipy import fft
 
@@ -50,7 +51,7 @@ def _kernel_matrix(kernel_at, width, rows, columns, out_rows):
         near = np.flatnonzero(np.abs(theta - t) <= reach)
         cosine = np.cos(t) * np.cos(theta[near, None]) + np.sin(t) * np.sin(theta[near, None]) * np.cos(delta)
         kernel = np.interp(np.arccos(np.clip(cosine, -1, 1)).astype(np.float32), angles, table, right=0.0)
-        spectrum = fft.dct(kernel.astype(np.float32), type=1, axis=1)  # cosine series: K is even in Δφ
+        spectrum = np.asarray(fft.dct(kernel.astype(np.float32), type=1, axis=1))  # cosine series: K is even in Δφ
         matrix[:, i] = (spectrum @ fold).T @ hat[near]
         matrix[:, out_rows - 1 - i] = matrix[:, i, ::-1]  # the southern hemisphere mirrors the northern
     return matrix / matrix[0].sum(1)[None, :, None]
@@ -71,7 +72,8 @@ def _fold(count, columns, frequencies):
 
 @dataclass(frozen=True)
 class Prefilter:
-    """The operator for environments of ``size`` (rows, columns). ``maps`` are the (rows, columns) of each level's map."""
+    """The operator (5) for environments of ``size`` (rows, columns). ``maps`` are the (rows, columns) of each level's map,
+    ``matrices`` the M_m of each level but the first, [frequencies, rows of the map, rows]."""
 
     size: tuple[int, int]
     maps: tuple[tuple[int, int], ...]
@@ -79,7 +81,7 @@ class Prefilter:
 
     @property
     def offsets(self) -> np.ndarray:
-        """[levels] first texel of each level in the concatenated output."""
+        """The first texel of each level in the concatenated output, [levels]."""
         return np.concatenate([[0], np.cumsum([r * c for r, c in self.maps])[:-1]]).astype(np.uint32)
 
     @property
@@ -88,41 +90,43 @@ class Prefilter:
         return sum(r * c for r, c in self.maps)
 
     def apply(self, texels: np.ndarray) -> np.ndarray:
-        """[rows, columns, 3] float32 to the maps of all levels, [texels, 3]."""
+        """Filter ``texels`` [rows, columns, 3] float32: return the maps of all levels, [texels, 3]."""
         rows, columns = self.size
-        spectrum = fft.rfft(texels.transpose(1, 0, 2), axis=0)  # [M, rows, 3]
+        spectrum = np.asarray(fft.rfft(texels.transpose(1, 0, 2), axis=0))  # [M, rows, 3]
         out = [texels.reshape(-1, 3)]
         for (_, c), matrix in zip(self.maps[1:], self.matrices):
             m = matrix.shape[0]
             product = matrix @ spectrum[:m].view(np.float32)
             level = product.view(np.complex64) * self._phase(m, c)[:, None, None] * np.float32(c / columns)
-            out.append(fft.irfft(level, n=c, axis=0).transpose(1, 0, 2).reshape(-1, 3))
+            out.append(np.asarray(fft.irfft(level, n=c, axis=0)).transpose(1, 0, 2).reshape(-1, 3))
         return np.concatenate(out)
 
     def transpose(self, adjoint: np.ndarray) -> np.ndarray:
-        """[texels, 3] to [rows, columns, 3]: the transpose of `apply`."""
+        """Take the ``adjoint`` [texels, 3] of the maps to that of the environment, [rows, columns, 3]: the transpose of
+        `apply`."""
         rows, columns = self.size
         first = rows * columns
         spectrum = np.zeros((columns // 2 + 1, rows, 3), np.complex64)
         for (r, c), matrix, offset in zip(self.maps[1:], self.matrices, self.offsets[1:]):
             m = matrix.shape[0]
             level = adjoint[offset : offset + r * c].reshape(r, c, 3).transpose(1, 0, 2)
-            level = fft.rfft(level, axis=0)[:m] * self._phase(m, c).conj()[:, None, None]
+            level = np.asarray(fft.rfft(level, axis=0))[:m] * self._phase(m, c).conj()[:, None, None]
             if c % 2 == 0 and m == c // 2 + 1 and c < columns:
                 level[-1] *= 0.5  # irfft reads the highest frequency of a short map once, of a long one twice
             spectrum[:m] += (matrix.transpose(0, 2, 1) @ np.ascontiguousarray(level).view(np.float32)).view(np.complex64)
-        grad = fft.irfft(spectrum, n=columns, axis=0).transpose(1, 0, 2)
+        grad = np.asarray(fft.irfft(spectrum, n=columns, axis=0)).transpose(1, 0, 2)
         return grad + adjoint[:first].reshape(rows, columns, 3)
 
     def _phase(self, m, c):
-        """Texel centres lie half a texel from Δφ = 0, and texels of a coarser map are wider."""
+        """Texel centers lie half a texel from Δφ = 0, and texels of a coarser map are wider."""
         shift = np.pi / c - np.pi / self.size[1]
         return np.exp(1j * np.arange(m) * shift).astype(np.complex64)
 
 
 @functools.lru_cache(maxsize=4)
 def prefilter(rows: int, columns: int, variant: str) -> Prefilter:
-    """The operator for an environment of rows × columns texels; some seconds the first time. ``variant`` keys the cache."""
+    """Return the operator for an environment of ``rows`` × ``columns`` texels, which takes some seconds the first time;
+    ``variant``, the active one, keys the cache."""
     maps, matrices = [(rows, columns)], []
     lobes = [(functools.partial(lobe, roughness), roughness**2, level_rows) for roughness, level_rows in LEVELS[1:]]
     for kernel_at, width, level_rows in [*lobes, (np.cos, 1.0, _DIFFUSE_ROWS)]:
@@ -155,7 +159,7 @@ class _Apply(dr.CustomOp):
         return "rgs_mi.shading.Prefilter"
 
 
-def apply(texels, operator: Prefilter):
-    """Filtered maps of all levels, ``mi.Float`` of width operator.texels · 4; differentiable in ``texels``, the flat
-    ``mi.Float`` of an environment's rows × columns × 3 values."""
+def apply(texels: "mi.Float", operator: Prefilter) -> "mi.Float":
+    """Return the filtered maps of all levels, of width operator.texels · 4; differentiable in ``texels``, the rows · columns
+    · 3 values of an environment."""
     return dr.custom(_Apply, texels, operator)

@@ -1,5 +1,5 @@
-"""f_φ, the shader that RGS puts between the specular integral and the pixel and leaves unspecified (`method.md` §3): here a
-gain per channel that a tiny `drjit.nn` network m_φ gives.
+"""f_φ, the shader that RGS puts between the specular integral and the pixel and leaves unspecified (docs/method.md §3): here
+a gain per channel that a tiny `drjit.nn` network m_φ gives.
 
     f_φ(C_s) = C_s · exp(ρ tanh m_φ(log(1 + C_s), roughness, n·ω_o, 1)),   ρ = log 4                       (6)
 
@@ -13,6 +13,7 @@ half precision.
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -31,12 +32,12 @@ _REMEDY = "export the scene again, or remove 'shader' from its integrator"
 
 @dataclass
 class Shader:
-    """``weights``: ``mi.TensorXf`` [WEIGHTS], the layers of `SHAPES` one after the other, row-major."""
+    """f_φ of (6). ``weights`` [WEIGHTS] are the layers of `SHAPES` one after the other, row-major."""
 
     weights: "mi.TensorXf"
 
-    def __call__(self, C_s, roughness, cosine):
-        """f_φ of ``C_s`` (``mi.Color3f``, linear radiance ≥ 0) for ``roughness`` and ``cosine`` = n·ω_o, a lane a pixel;
+    def __call__(self, C_s: "mi.Color3f", roughness: "mi.Float", cosine: "mi.Float") -> "mi.Color3f":
+        """Return f_φ of ``C_s`` (linear radiance ≥ 0) for ``roughness`` and ``cosine`` = n·ω_o, one entry per pixel;
         differentiable in all of them and in the weights, in both modes."""
         values = [*dr.log(1 + dr.maximum(C_s, 0)), roughness, cosine, mi.Float(1)]
         n = dr.width(values)
@@ -59,18 +60,20 @@ class Shader:
 
     # ---- Files ----
 
-    def save(self, path):
+    def save(self, path: str | Path) -> None:
         """Write an ``.npz`` with ``weights_0``, ``weights_1``, …, float32 of `SHAPES`, whole or not at all.
 
         Raises: UserError where the disk is full or the folder can't be written.
         """
         parts = np.split(dr.detach(self.weights).numpy(), np.cumsum([rows * columns for rows, columns in SHAPES])[:-1])
+        arrays: dict[str, Any] = {name: part.reshape(shape) for (name, shape), part in zip(_arrays().items(), parts)}
         with atomic_file(path) as stream:
-            np.savez(stream, **{name: part.reshape(shape) for (name, shape), part in zip(_arrays().items(), parts)})
+            np.savez(stream, **arrays)
 
     @classmethod
-    def load(cls, path) -> "Shader":
-        """The shader that wrote the file. Raises: UserError where it is missing, damaged, or holds another network."""
+    def load(cls, path: str | Path) -> "Shader":
+        """Return the shader that `save` wrote. Raises: UserError where the file is missing, damaged, or holds another
+        network."""
         path = Path(path)
         try:
             with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
@@ -96,7 +99,7 @@ def _arrays():
 
 
 def initial_weights(seed: int) -> np.ndarray:
-    """[WEIGHTS] of a shader that is the identity: random hidden layers, and zeros."""
+    """Return the weights [WEIGHTS] of a shader that is the identity: random hidden layers, and zeros."""
     rng = dr.rng(seed)
     layers = [nn.Linear(columns, rows, bias=False).alloc(mi.TensorXf, rng=rng).weights.numpy() for rows, columns in SHAPES]
     return np.concatenate([*(layer.ravel() for layer in layers[:-1]), np.zeros(layers[-1].size, np.float32)])

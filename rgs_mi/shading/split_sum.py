@@ -12,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from . import tables
-from .environment import FilteredEnvironment
+from .environment import FilteredEnvironment, IncidentRadiance
 from .taps import taps
 
 DEFAULT_ETA = 1.5  # the principled BSDF's default, specular = 0.5
@@ -20,18 +20,27 @@ DEFAULT_ETA = 1.5  # the principled BSDF's default, specular = 0.5
 
 @dataclass
 class SplitSum:
-    """``environment``: filtered. ``eta``: index of refraction. ``entries``: a table of `taps` (None: the shipped one)."""
+    """The split-sum estimator, with a filtered ``environment``, an index of refraction ``eta``, and a table of `taps`
+    (None: the shipped one)."""
 
     environment: FilteredEnvironment
     eta: float = DEFAULT_ETA
     entries: "mi.Float | None" = None
 
-    def specular(self, normal, view, roughness, metallic, base_color, incident_radiance=None):
-        """C_s, ``mi.Color3f``: radiance that the specular lobes of surfaces, one a lane, reflect towards ``view``.
+    def specular(
+        self,
+        normal: "mi.Vector3f",
+        view: "mi.Vector3f",
+        roughness: "mi.Float",
+        metallic: "mi.Float",
+        base_color: "mi.Color3f",
+        incident_radiance: IncidentRadiance | None = None,
+    ) -> "mi.Color3f":
+        """Return C_s, the linear radiance that the specular lobes of surfaces reflect towards ``view``; all arguments have
+        one entry per surface, and the result is differentiable in them.
 
-        ``normal``, ``view``: unit, world space, ``view`` from the surface to the camera. ``incident_radiance(radiance, direction,
-        index)``: callback that returns incident radiance after occlusion along ``direction`` at the surface ``index`` (None:
-        each at its own), where the unoccluded environment has ``radiance``; None means the unoccluded environment.
+        ``normal`` and ``view`` are unit vectors in world space, ``view`` from the surface to the camera.
+        ``incident_radiance``: callback that returns incident radiance after occlusion; None means the unoccluded environment.
         """
         cosine = dr.dot(normal, view)
         reflected = 2 * cosine * normal - view
@@ -43,24 +52,35 @@ class SplitSum:
             incoming = incident_radiance(incoming, reflected, None)
         return incoming * E
 
-    def diffuse(self, normal, view, roughness, metallic, base_color, incident_radiance=None, irradiance_visibility=1):
-        """The same for the diffuse lobe, which receives the part ``irradiance_visibility`` of the light ((9) of `indirect`);
-        ``incident_radiance`` is not called, since that lobe has no one direction."""
+    def diffuse(
+        self,
+        normal: "mi.Vector3f",
+        view: "mi.Vector3f",
+        roughness: "mi.Float",
+        metallic: "mi.Float",
+        base_color: "mi.Color3f",
+        incident_radiance: IncidentRadiance | None = None,
+        irradiance_visibility: "mi.Color3f | float" = 1,
+    ) -> "mi.Color3f":
+        """Return C_d of the diffuse lobe, as `specular` does C_s. It receives the part ``irradiance_visibility`` of the light
+        ((9) of `indirect.py`); ``incident_radiance`` is not called, since that lobe has no one direction."""
         E = _table(dr.dot(normal, view), roughness, (3,), self.eta)[0]
         return self.environment.eval_diffuse(normal) * irradiance_visibility * E * (1 - metallic) * base_color
 
     def for_secondary_bounce(self) -> "SplitSum":
-        """The estimator of what a reflected ray meets."""
+        """Return the estimator of what a reflected ray meets: this one."""
         return self
 
-    def with_texels(self, texels) -> "SplitSum":
-        """The same with other ``texels`` of the environment."""
+    def with_texels(self, texels: "mi.Float") -> "SplitSum":
+        """Return the same estimator with other ``texels`` of its `FilteredEnvironment`."""
         return replace(self, environment=replace(self.environment, texels=texels))
 
 
-def albedo(cosine, roughness, metallic, base_color, eta):
-    """(E of (4), ``mi.Color3f``: what the specular lobes reflect of a constant environment; φ, ``mi.Float``: the part of it
-    that Schlick's Fresnel term adds to a mirror of the constant colour F_0)."""
+def albedo(
+    cosine: "mi.Float", roughness: "mi.Float", metallic: "mi.Float", base_color: "mi.Color3f", eta: float
+) -> "tuple[mi.Color3f, mi.Float]":
+    """Return E of (4), what the specular lobes reflect of a constant environment, and φ, the part of it that Schlick's
+    Fresnel term adds to a mirror of the constant colour F_0; ``cosine`` is n·ω_o, ``eta`` the index of refraction."""
     dielectric, black, white = _table(cosine, roughness, (0, 1, 2), eta)
     E = (1 - metallic) * dielectric + metallic * (base_color * (white - black) + black)
     mean = lambda color: (color.x + color.y + color.z) / 3  # dr.mean() would take that of all lanes
@@ -69,7 +89,7 @@ def albedo(cosine, roughness, metallic, base_color, eta):
 
 
 def _table(cosine, roughness, columns, eta):
-    """Entries number ``columns`` of `tables.albedo_table`, interpolated, a list of ``mi.Float``."""
+    """The entries ``columns`` of `tables.albedo_table`, interpolated, a list of ``mi.Float``."""
     table = tables.albedo_table(eta, mi.variant())
     entries = mi.Float(table.transpose(2, 0, 1).ravel())
     plane = tables.COSINES * tables.ROUGHNESSES

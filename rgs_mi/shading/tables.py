@@ -23,18 +23,20 @@ MIN_ROUGHNESS = 0.032  # the principled BSDF clamps its GGX width α = roughness
 
 
 def cosine_nodes() -> np.ndarray:
-    """[COSINES] values of n·ω_o at the table's rows: quadratic, since albedos bend near grazing angles."""
+    """Return the values of n·ω_o at the table's rows, [COSINES]: quadratic, since albedos bend near grazing angles."""
     return np.linspace(0, 1, COSINES) ** 2
 
 
 def roughness_nodes() -> np.ndarray:
-    """[ROUGHNESSES] values of roughness at the table's columns."""
+    """Return the values of roughness at the table's columns, [ROUGHNESSES]."""
     return np.linspace(0, 1, ROUGHNESSES)
 
 
-def cell(cosine, roughness, rows, columns):
-    """(row, column, f_row, f_column): the lower corner, ``mi.Int32``, of the cell that holds ``cosine`` and ``roughness`` in
-    a table of rows × columns over [0, 1]², rows quadratic in the cosine, and how far into the cell they are."""
+def cell(
+    cosine: "mi.Float", roughness: "mi.Float", rows: int, columns: int
+) -> "tuple[mi.Int32, mi.Int32, mi.Float, mi.Float]":
+    """Return (row, column, f_row, f_column): the lower corner of the cell that holds ``cosine`` and ``roughness`` in a table
+    of ``rows`` × ``columns`` over [0, 1]², rows quadratic in the cosine, and how far into the cell they are, in [0, 1]."""
     y = dr.sqrt(dr.maximum(cosine, 1e-6)) * (rows - 1)
     x = dr.clip(roughness, 0, 1) * (columns - 1)
     row = dr.clip(mi.Int32(dr.detach(y)), 0, rows - 2)
@@ -42,8 +44,8 @@ def cell(cosine, roughness, rows, columns):
     return row, column, y - mi.Float(row), x - mi.Float(column)
 
 
-def principled(roughness: float, metallic: float, base_color: float, eta: float):
-    """A stock principled BSDF with constant parameters."""
+def principled(roughness: float, metallic: float, base_color: float, eta: float) -> "mi.BSDF":
+    """Return a stock principled BSDF with constant parameters."""
     return mi.load_dict(
         {
             "type": "principled",
@@ -55,8 +57,8 @@ def principled(roughness: float, metallic: float, base_color: float, eta: float)
     )
 
 
-def interaction(wi):
-    """Surface interactions with local frame = world frame and incident directions ``wi``, one a lane."""
+def interaction(wi: "mi.Vector3f") -> "mi.SurfaceInteraction3f":
+    """Return surface interactions whose local frame is the world's, one per incident direction ``wi``."""
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(wi))
     si.t, si.n, si.wi = mi.Float(1), mi.Normal3f(0, 0, 1), wi
     si.sh_frame = mi.Frame3f(si.n)
@@ -65,7 +67,8 @@ def interaction(wi):
 
 @functools.lru_cache(maxsize=4)
 def albedo_table(eta: float, variant: str) -> np.ndarray:
-    """[COSINES, ROUGHNESSES, 4] float32: (E_dielectric, E_black, E_white) of (4), E_diffuse. ``variant`` keys the cache."""
+    """Return (E_dielectric, E_black, E_white) of (4) and E_diffuse, [COSINES, ROUGHNESSES, 4] float32, for the index of
+    refraction ``eta``; ``variant``, the active one, keys the cache."""
     mu = np.maximum(cosine_nodes(), 1e-3)
     wi = mi.Vector3f(mi.Float(np.sqrt(1 - mu**2)), 0, mi.Float(mu))
     n = _SIDE * _SIDE
@@ -96,8 +99,8 @@ def albedo_table(eta: float, variant: str) -> np.ndarray:
 
 
 def lobe(roughness: float, angles: np.ndarray) -> np.ndarray:
-    """BSDF times cosine of a white metal seen along its normal, at ``angles`` (radians) from the normal: the shape of the
-    split-sum's filter kernel, not normalised."""
+    """Return BSDF times cosine of a white metal seen along its normal, at ``angles`` (radians, [N]) from the normal: the
+    shape of the split sum's filter kernel, not normalized."""
     wo = mi.Vector3f(mi.Float(np.sin(angles)), 0, mi.Float(np.cos(angles)))
     wi = mi.Vector3f(dr.zeros(mi.Float, len(angles)), 0, 1)
     return principled(roughness, 1, 1, 1.5).eval(mi.BSDFContext(), interaction(wi), wo).x.numpy().astype(np.float64)

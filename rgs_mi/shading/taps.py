@@ -27,8 +27,8 @@ COUNT, COSINES, ROUGHNESSES, FRACTIONS = SHAPE = (3, 10, 9, 2)
 
 @functools.lru_cache(maxsize=1)
 def shipped() -> np.ndarray:
-    """[*SHAPE, 4] float32: the table of this package."""
-    with (resources.files(__package__) / FILE).open("rb") as stream:
+    """Return the table of this package, [*SHAPE, 4] float32."""
+    with (resources.files("rgs_mi.shading") / FILE).open("rb") as stream:
         return np.load(stream, allow_pickle=False)
 
 
@@ -37,8 +37,11 @@ def _entries(variant):
     return as_float(shipped())
 
 
-def taps(cosine, roughness, phi, entries=None) -> list:
-    """[(a, r_k, w)] of (8), a ``mi.Float`` each; ``entries``: a flat table of `SHAPE` (None: the shipped one)."""
+def taps(
+    cosine: "mi.Float", roughness: "mi.Float", phi: "mi.Float", entries: "mi.Float | None" = None
+) -> "list[tuple[mi.Float, mi.Float, mi.Float]]":
+    """Return (a_k, r_k, w_k) of (8) for each of `COUNT` taps; ``cosine`` is n·ω_o, ``phi`` that of `split_sum.albedo`, and
+    ``entries`` a flat table of `SHAPE` (None: the shipped one)."""
     if entries is None:
         entries = _entries(mi.variant())
     row, column, fy, fx = cell(cosine, roughness, COSINES, ROUGHNESSES)

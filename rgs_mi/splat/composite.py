@@ -1,12 +1,12 @@
-"""Front-to-back compositing of surfels in one walk over the tile intersections, and its replayed adjoint.
+"""Front-to-back compositing of surfels in one walk over the tile intersections, and its replayed adjoint (docs/method.md §2).
 
 Per pixel, over its block's surfels front to back, with T_1 = 1:
 
     α_i = o_i exp(−½ min(u² + v², LOW_PASS |δ|²)),   w_i = T_i α_i,   T_{i+1} = T_i − w_i,
     image = Σ_i w_i (features_i, t_i, 1), and where asked t_i²                                     (2)
 
-The normal among the features is n_i + u ∂n_i/∂u + v ∂n_i/∂v, what `Surfels.normal_derivatives` makes of it;
-where the low-pass decides, it is the centre's, as the depth is.
+The normal among the features is n_i + u ∂n_i/∂u + v ∂n_i/∂v, with the derivatives of `Surfels.normal_derivatives`;
+where the low-pass decides, it is the center's, as the depth is.
 
 The adjoint walks the same lists again, front to back, and stores nothing per step. With g_i the inner product of the
 pixel's adjoint with surfel i's vector in (2), and rest_i = Σ_{j>i} w_j g_j,
@@ -23,7 +23,8 @@ import drjit as dr
 import mitsuba as mi
 
 from .hit import PACKET, Hit, adding, fetch, pack, padded
-from .project import GEOMETRY
+from .intersect import TileIntersections
+from .project import GEOMETRY, Projected
 from .tiles import Cutoffs, block_pixels
 
 _NORMAL = 3  # the first of its three features
@@ -42,16 +43,18 @@ class Layout:
     squares: bool = False
 
     @property
-    def gaussian(self):
+    def gaussian(self) -> int:
+        """Floats in a projected Gaussian's row."""
         return padded(len(GEOMETRY) + self.features + _DERIVATIVES)
 
     @property
-    def pixel(self):
+    def pixel(self) -> int:
+        """Floats in a pixel."""
         return padded(self.values)
 
     @property
-    def values(self):
-        """Numbers in a pixel, without padding."""
+    def values(self) -> int:
+        """Floats in a pixel, without padding."""
         return self.features + 2 + self.squares
 
 
@@ -62,12 +65,12 @@ def _normal_derivatives(gaussian, layout):
 
 
 def _turned(gaussian, layout, offset):
-    """What the normal of a projected Gaussian changes by, ``offset`` (u, v) from its centre."""
+    """What the normal of a projected Gaussian changes by, ``offset`` (u, v) from its center."""
     return [offset[0] * a + offset[1] * b for a, b in zip(*_normal_derivatives(gaussian, layout))]
 
 
 def _features(gaussian, layout, offset):
-    """The features of a projected Gaussian where a pixel meets it, ``offset`` (u, v) from its centre."""
+    """The features of a projected Gaussian where a pixel meets it, ``offset`` (u, v) from its center."""
     values = gaussian[len(GEOMETRY) : len(GEOMETRY) + layout.features]
     for k, turn in enumerate(_turned(gaussian, layout, offset), _NORMAL):
         values[k] = values[k] + turn
@@ -75,8 +78,8 @@ def _features(gaussian, layout, offset):
 
 
 def _walk(isects, layout, state, body):
-    """Run ``body(surfel, pixels, T, state) -> (T, state)`` over every block's list; T and state are lists, one a pixel of a
-    block. Returns the final state."""
+    """Run ``body(surfel, pixels, T, state) -> (T, state)`` over every block's list; T and state are lists with an entry per
+    pixel of a block. Returns the final state."""
     _, pixels = block_pixels(layout.size)
     centers = [(mi.Float(x) + 0.5, mi.Float(y) + 0.5) for x, y in pixels]
     end = isects.first + isects.count
@@ -96,7 +99,7 @@ def _walk(isects, layout, state, body):
 
 
 def _image_rows(layout):
-    """(row-major pixel number, inside the image?) for each pixel of a block."""
+    """(row-major index of the pixel, inside the image?) for each pixel of a block."""
     width, height = layout.size
     _, pixels = block_pixels(layout.size)
     return [(y * width + x, (x < width) & (y < height)) for x, y in pixels]
@@ -119,9 +122,9 @@ def _scatter_image(values, layout):
 
 
 class Composite(dr.CustomOp):
-    """Projected Gaussians to image (2), with adjoint (3) and tangent."""
+    """The custom operation from projected Gaussians to the image of (2), with its adjoint (3) and its tangent."""
 
-    def eval(self, gaussian, isects, layout):
+    def eval(self, gaussian: "mi.Float", isects: TileIntersections, layout: Layout) -> "mi.Float":
         self.gaussian, self.isects, self.layout = dr.detach(gaussian), isects, layout
         n = layout.features
 
@@ -141,7 +144,7 @@ class Composite(dr.CustomOp):
         dr.eval(self.image)
         return self.image
 
-    def backward(self):
+    def backward(self) -> None:
         layout, n = self.layout, self.layout.features
         adjoint = _gather_image(self.grad_out(), layout)
         image = _gather_image(self.image, layout)
@@ -184,7 +187,7 @@ class Composite(dr.CustomOp):
         dr.eval(_walk(self.isects, layout, lambda pixels: rest, body))
         self.set_grad_in("gaussian", gradient)
 
-    def forward(self):
+    def forward(self) -> None:
         layout, n = self.layout, self.layout.features
         tangent = self.grad_in("gaussian")
 
@@ -208,13 +211,13 @@ class Composite(dr.CustomOp):
         state = _walk(self.isects, layout, start, body)
         self.set_grad_out(_scatter_image([out_ for _, out_ in state], layout))
 
-    def name(self):
+    def name(self) -> str:
         return "rgs_mi.splat.Composite"
 
 
-def composite(projected, features, isects, layout):
-    """The image of (2): ``mi.Float`` of width H · W · layout.pixel, row-major, each pixel (features, depth, alpha, perhaps
-    depth², padding). ``features``: a list of ``mi.Float`` of width N, the normal's three after the first three.
-    Differentiable in the projected Gaussians, in both modes."""
+def composite(projected: Projected, features: "list[mi.Float]", isects: TileIntersections, layout: Layout) -> "mi.Float":
+    """Return the image of (2), of width H · W · layout.pixel, row-major, each pixel (features, depth, alpha, perhaps depth²,
+    padding). ``features`` have width N, the normal's three come after the first three. Differentiable in the projected
+    Gaussians, in both modes."""
     normal_derivatives = [value for derivative in projected.normal_derivatives for value in derivative]
     return dr.custom(Composite, pack(projected.geometry + features + normal_derivatives), isects, layout)

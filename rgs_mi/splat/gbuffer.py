@@ -1,25 +1,32 @@
-"""The G-buffer: all maps of a view from one walk (`method.md` §2)."""
+"""The G-buffer: all maps of a view from one walk (docs/method.md §2)."""
 
 import functools
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 
+from ..core.camera import Camera
 from .composite import Layout, composite
 from .intersect import isect_tiles
 from .project import project
 from .tiles import Cutoffs
 
+if TYPE_CHECKING:
+    from ..surfels.surfels import Surfels
+
 
 @dataclass
 class Maps:
-    """Accumulated attributes, a lane a pixel; each is Σ w · attribute, so divide by ``alpha`` for means.
+    """Accumulated attributes, one entry per pixel; each is Σ w · attribute, so divide by ``alpha`` for means.
 
-    diffuse        Σ w c, linear radiance                 ``mi.Color3f``
-    normal         Σ w (n(u, v) + Δn), world space        ``mi.Vector3f``
-    base_color, roughness, metallic, depth (z), alpha = Σ w
-    delta_normal   Σ w Δn                                 ``mi.Vector3f``
+    diffuse        Σ w c, linear radiance
+    normal         Σ w (n(u, v) + Δn), world space
+    base_color, roughness, metallic   Σ w times each, material parameters in [0, 1]
+    depth          Σ w z, camera-space z
+    alpha          Σ w, coverage in [0, 1]
+    delta_normal   Σ w Δn, world space
     square         Σ w z²; this and delta_normal where `render_gbuffer` was asked for all maps, else None
     """
 
@@ -36,8 +43,8 @@ class Maps:
 
 @dataclass
 class GBuffer:
-    """All maps of a view of ``size`` (width, height) pixels, interleaved as `composite` writes them (row-major), and
-    ``seen``: one flag a surfel, whether any tile of this view lists it."""
+    """All maps of a view of ``size`` (width, height) pixels, interleaved in ``image`` as `composite` writes them (row-major);
+    ``seen`` says of each surfel whether any tile of this view lists it, ``full`` whether all maps are there."""
 
     size: tuple[int, int]
     image: "mi.Float"
@@ -49,8 +56,8 @@ class GBuffer:
         """The maps of every pixel."""
         return self.maps(dr.arange(mi.UInt32, self.size[0] * self.size[1]))
 
-    def maps(self, index) -> Maps:
-        """The maps at pixels number ``index``."""
+    def maps(self, index: "mi.UInt32") -> Maps:
+        """Return the maps at the pixels ``index`` (row-major)."""
         packets = 5 if self.full else 4
         m = [v for q in range(packets) for v in dr.gather(mi.Vector4f, self.image, index * packets + q)]
         delta, m[11:] = (mi.Vector3f(*m[11:14]), m[14:]) if self.full else (None, m[11:])
@@ -67,9 +74,15 @@ class GBuffer:
         )
 
 
-def render_gbuffer(surfels, camera, means2d_offset=None, cutoffs=Cutoffs(), full=False) -> GBuffer:
-    """Splat ``surfels`` into ``camera``; differentiable in all fields. ``means2d_offset``: see `project`. ``full``: make the
-    maps that only regularisers want, too."""
+def render_gbuffer(
+    surfels: "Surfels",
+    camera: Camera,
+    means2d_offset: "mi.Vector2f | None" = None,
+    cutoffs: Cutoffs = Cutoffs(),
+    full: bool = False,
+) -> GBuffer:
+    """Splat ``surfels`` into ``camera``; differentiable in all fields. ``means2d_offset`` is that of `project`; ``full`` asks
+    for the maps that only regularizers want, too."""
     projected = project(surfels, camera, means2d_offset)
     delta = surfels.column(mi.Vector3f, "delta_normal")
     features = [

@@ -1,34 +1,35 @@
 """A pixel meets a surfel: the weight and depth of its hit, their derivatives, and what surfels are sorted by."""
 
 import math
+from collections.abc import Sequence
 
 import drjit as dr
 import mitsuba as mi
 
 from .project import GEOMETRY
-from .tiles import BLOCK, LOW_PASS
+from .tiles import BLOCK, LOW_PASS, Cutoffs
 
 PACKET = 4  # floats per gather and scatter
 HORIZON = 1e-5  # least h of (1): beyond it a ray runs along the surfel's plane, or meets it behind the camera
 _LEAST_ROWS = 1024
 _MOST_COPIED = 2**26  # floats, in all threads together
-_HALF_DIAGONAL = 0.5 * math.hypot(BLOCK[0] - 1, BLOCK[1] - 1)  # from a block's middle to its pixels' centres
+_HALF_DIAGONAL = 0.5 * math.hypot(BLOCK[0] - 1, BLOCK[1] - 1)  # from a block's middle to its pixels' centers
 
 
-def padded(count):
-    """Floats of a row that holds ``count``."""
+def padded(count: int) -> int:
+    """Return the floats of a row that holds ``count``: the next multiple of `PACKET`."""
     return -(-count // PACKET) * PACKET
 
 
-def adding(floats):
-    """The fastest way to add into so many ``floats`` from lanes that meet different ones at a time: a copy for each thread,
-    twice as fast as atomics, while these fit into memory."""
+def adding(floats: int) -> "dr.ReduceMode":
+    """Return the fastest mode to add into so many ``floats`` from lanes that meet different ones at a time: a copy for each
+    thread, twice as fast as atomics, while these fit into memory."""
     return dr.ReduceMode.Expand if floats * dr.thread_count() <= _MOST_COPIED else dr.ReduceMode.Local
 
 
-def pack(columns):
-    """Rows of PACKET-aligned floats, ``mi.Float``, from a list of ``mi.Float``, and room up to a power of two of rows: the
-    kernel that adds gradients into them (``ReduceMode.Expand``) has their number compiled in."""
+def pack(columns: "list[mi.Float]") -> "mi.Float":
+    """Interleave ``columns`` of width N into rows of `padded` floats, with room up to a power of two of rows: the kernel that
+    adds gradients into them (``ReduceMode.Expand``) has their number compiled in."""
     stride = padded(len(columns))
     columns = columns + [mi.Float(0)] * (stride - len(columns))
     n = dr.width(columns)
@@ -39,8 +40,8 @@ def pack(columns):
     return out
 
 
-def fetch(buffer, row, stride, active=True):
-    """The ``stride`` floats of row ``row``, as a list; zeros where not ``active``."""
+def fetch(buffer: "mi.Float", row: "mi.UInt32", stride: int, active: "mi.Bool | bool" = True) -> "list[mi.Float]":
+    """Return the ``stride`` floats of each ``row`` of what `pack` made; zeros where not ``active``."""
     floats = []
     for q in range(stride // PACKET):
         floats += list(dr.gather(mi.Vector4f, buffer, row * (stride // PACKET) + q, active))
@@ -48,9 +49,14 @@ def fetch(buffer, row, stride, active=True):
 
 
 class Hit:
-    """One pixel against one projected Gaussian: equation (1) of `project.py` and the weight of (2) of `composite.py`."""
+    """One pixel, at (x, y), against one projected Gaussian, a row of `pack`: equation (1) of `project.py` and the weight of
+    (2) of `composite.py`.
 
-    def __init__(self, gaussian, x, y, cutoffs):
+    ``alpha``: α of (2); ``t``: depth (camera-space z); ``offset``: (u, v) of the hit in standard deviations, 0 where the
+    low-pass decides.
+    """
+
+    def __init__(self, gaussian: "Sequence[mi.Float]", x: "mi.Float", y: "mi.Float", cutoffs: Cutoffs):
         X, Y, A_x, A_y, B_x, B_y, N_x, N_y, z, opacity = gaussian[: len(GEOMETRY)]
         self.dx, self.dy = x - X, y - Y
         h = 1 + N_x * self.dx + N_y * self.dy
@@ -60,7 +66,7 @@ class Hit:
         self.v = (B_x * self.dx + B_y * self.dy) * self.inv_h
         on_plane = dr.select(in_front, self.u * self.u + self.v * self.v, dr.largest(mi.Float))
         on_screen = LOW_PASS * (self.dx * self.dx + self.dy * self.dy)
-        self.on_plane = on_plane <= on_screen  # else the low-pass decides, and the depth is the centre's
+        self.on_plane = on_plane <= on_screen  # else the low-pass decides, and the depth is the center's
         self.offset = [dr.select(self.on_plane, value, 0) for value in (self.u, self.v)]  # where normals are taken
         self.gauss = dr.exp(-0.5 * dr.minimum(on_plane, on_screen))
         alpha = opacity * self.gauss
@@ -69,8 +75,9 @@ class Hit:
         self.alpha = dr.select(self.kept, dr.minimum(alpha, cutoffs.alpha_max), 0)
         self.t = dr.select(self.on_plane, z * self.inv_h, z)
 
-    def sort_key(self, gaussian, cutoffs):
-        """t, if this hit is in the middle of a block's pixels, and −∞ where none of them can see the surfel."""
+    def sort_key(self, gaussian: "Sequence[mi.Float]", cutoffs: Cutoffs) -> "mi.Float":
+        """Return the depth t, if this hit is in the middle of a block's pixels, and −∞ where none of them can see the
+        surfel."""
         _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, opacity = gaussian[: len(GEOMETRY)]
         tilt = _HALF_DIAGONAL * dr.sqrt(N_x * N_x + N_y * N_y)
         turn = _HALF_DIAGONAL * dr.sqrt(A_x * A_x + A_y * A_y + B_x * B_x + B_y * B_y)
@@ -82,8 +89,10 @@ class Hit:
         nearest = dr.maximum(dr.minimum(on_plane, on_screen), 0)
         return dr.select(opacity * dr.exp(-0.5 * nearest * nearest) > cutoffs.alpha_min, self.t, -dr.inf)
 
-    def vjp(self, gaussian, d_alpha, d_t, d_offset):
-        """Gradient of the ten geometric numbers, from that of α, t and the offset."""
+    def vjp(
+        self, gaussian: "Sequence[mi.Float]", d_alpha: "mi.Float", d_t: "mi.Float", d_offset: "Sequence[mi.Float]"
+    ) -> "list[mi.Float]":
+        """Return the gradient of the ten geometric numbers, from that of α, t and the offset (vector-Jacobian product)."""
         _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, _ = gaussian[: len(GEOMETRY)]
         d_alpha = dr.select(self.kept & ~self.clamped, d_alpha, 0)
         d_rho = -0.5 * self.alpha * d_alpha
@@ -109,8 +118,10 @@ class Hit:
             d_alpha * self.gauss,
         ]
 
-    def jvp(self, gaussian, tangent):
-        """The tangents of α, t and the offset, from that of the projected Gaussian."""
+    def jvp(
+        self, gaussian: "Sequence[mi.Float]", tangent: "Sequence[mi.Float]"
+    ) -> "tuple[mi.Float, mi.Float, list[mi.Float]]":
+        """Return the tangents of α, t and the offset, from that of the projected Gaussian (Jacobian-vector product)."""
         _, _, A_x, A_y, B_x, B_y, N_x, N_y, z, _ = gaussian[: len(GEOMETRY)]
         X_, Y_, A_x_, A_y_, B_x_, B_y_, N_x_, N_y_, z_, opacity_ = tangent[: len(GEOMETRY)]
         h_ = N_x_ * self.dx + N_y_ * self.dy - N_x * X_ - N_y * Y_

@@ -16,7 +16,8 @@ import drjit as dr
 import mitsuba as mi
 
 from .hit import Hit, fetch, pack, padded
-from .tiles import BLOCK, LOW_PASS, TILE, block_pixels, tile_grid
+from .project import Projected
+from .tiles import BLOCK, LOW_PASS, TILE, Cutoffs, block_pixels, tile_grid
 
 FAR = 1e6  # pixels: beyond every image
 SORT_RADIUS = 3.0  # standard deviations
@@ -24,8 +25,8 @@ SORT_RADIUS = 3.0  # standard deviations
 
 @dataclass
 class TileIntersections:
-    """``ids``: indices of surfels, front to back for each block (or tile); ``first`` and ``count``: each block's range of
-    ``ids``, between which there may be gaps; ``seen``: one flag a surfel, whether any tile lists it."""
+    """Which surfels each block (or tile) sees: ``ids`` are indices of surfels, front to back, ``first`` and ``count`` each
+    block's range of these, between which there may be gaps; ``seen`` says of each surfel whether any tile lists it."""
 
     ids: "mi.UInt32"
     first: "mi.UInt32"
@@ -107,8 +108,9 @@ def _depth_at_tile(geometry, column, row):
     return z / dr.clip(1 + shrink * (N_x * dx + N_y * dy), 0.5, 2)
 
 
-def isect_tiles(projected, size, cutoffs) -> TileIntersections:
-    """The surfels of every block of an image of ``size`` (width, height) pixels, blocks as `block_pixels` numbers them."""
+def isect_tiles(projected: Projected, size: tuple[int, int], cutoffs: Cutoffs) -> TileIntersections:
+    """Return the surfels that every block of an image of ``size`` (width, height) pixels sees, in the order in which it meets
+    them; blocks are in the order of `block_pixels`. Not differentiated."""
     with dr.suspend_grad():
         tiles = _tile_intersections(projected, size, cutoffs.alpha_min)
         tile, pixels = block_pixels(size)
@@ -116,17 +118,17 @@ def isect_tiles(projected, size, cutoffs) -> TileIntersections:
         end, stop = first + count, first + dr.select(count > 0, count + cutoffs.resort_window, 0)
         blocks = dr.width(tile) // dr.width(tiles.first)
         start = first * blocks + count * (dr.arange(mi.UInt32, dr.width(tile)) % blocks)  # room for the whole tile's list
-        middle = [mi.Float(corner) + 0.5 * n for corner, n in zip(pixels[0], BLOCK)]
+        x, y = (mi.Float(corner) + 0.5 * n for corner, n in zip(pixels[0], BLOCK))
         gaussians = pack(projected.geometry)
         ids = dr.empty(mi.UInt32, dr.width(tiles.ids) * blocks)
-        dr.eval(gaussians, first, end, stop, start, middle)
+        dr.eval(gaussians, first, end, stop, start, x, y)
 
         def step(i, at, depths, surfels):
             listed = i < end
             surfel = dr.gather(mi.UInt32, tiles.ids, i, listed)
             gaussian = fetch(gaussians, surfel, padded(len(projected.geometry)), listed)
             # One surfel enters the queue, the nearest leaves it; "farther than all" drives the rest out in the end.
-            depth = dr.select(listed, Hit(gaussian, *middle, cutoffs).sort_key(gaussian, cutoffs), dr.inf)
+            depth = dr.select(listed, Hit(gaussian, x, y, cutoffs).sort_key(gaussian, cutoffs), dr.inf)
             for k in reversed(range(cutoffs.resort_window)):
                 nearer = depth < depths[k]
                 depth, depths[k] = dr.minimum(depth, depths[k]), dr.maximum(depth, depths[k])

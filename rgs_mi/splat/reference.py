@@ -1,21 +1,28 @@
 """The splatter's slow, readable twin: every surfel against every pixel. The oracle of the tests.
 
 It shares no formula with the tiled one: rays are intersected with planes in world space, nothing is projected but the
-centre, no lists are formed, and Dr.Jit differentiates it. For scenes of some hundred surfels: all pairs are in memory.
+center, no lists are formed, and Dr.Jit differentiates it. So it also goes from pixels to rays by formulas of its own, not by
+`core.camera.pixel_rays`. For scenes of some hundred surfels: all pairs are in memory.
 """
+
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.camera import Camera
 from .gbuffer import Maps
 from .project import NEAR
 from .tiles import BLOCK, LOW_PASS, Cutoffs
 
+if TYPE_CHECKING:
+    from ..surfels.surfels import Surfels
+
 
 def _front_to_back(surfels, camera) -> np.ndarray:
-    """[pixels, N] numbers of the surfels in front of the camera, by the depth at which the ray through the middle of the
-    pixel's PIXELS block meets them."""
+    """[pixels, N] indices of the surfels in front of the camera, by the depth at which the ray through the middle of the
+    pixel's block meets them."""
     width, height = camera.size
     fields = {name: value.astype(np.float64) for name, value in surfels.numpy().items()}
     center = (fields["centers"] - camera.origin) @ camera.rotation.T
@@ -37,8 +44,8 @@ def _front_to_back(surfels, camera) -> np.ndarray:
     return order.repeat(BLOCK[1], 0).repeat(BLOCK[0], 1)[:height, :width].reshape(width * height, -1).astype(np.uint32)
 
 
-def render_gbuffer_reference(surfels, camera, cutoffs=Cutoffs()) -> Maps:
-    """The same maps as `render_gbuffer`, in the same frames and units."""
+def render_gbuffer_reference(surfels: "Surfels", camera: Camera, cutoffs: Cutoffs = Cutoffs()) -> Maps:
+    """Return all maps of `render_gbuffer`, in the same frames and units."""
     width, height = camera.size
     origin = mi.Point3f(camera.origin)
     x_axis, y_axis, z_axis = (mi.Vector3f(row) for row in camera.rotation)

@@ -3,6 +3,7 @@
 import drjit as dr
 import mitsuba as mi
 
+from ..core.bounding_box import BoundingBox
 from .surfels import Surfels
 
 _SOLID = 0.2  # a ray meets a surfel where it is at least this opaque
@@ -11,15 +12,16 @@ _CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 _TRIANGLES = (0, 1, 2, 0, 2, 3)
 
 
-def corners(surfels, extent):
-    """Corners of every surfel's quad, four ``mi.Point3f`` of width N; ``extent``: half its width in standard deviations."""
+def corners(surfels: Surfels, extent: "mi.Float") -> "list[mi.Point3f]":
+    """Return the four corners of every surfel's quad in world space, each of width N; ``extent`` is half its width in
+    standard deviations."""
     t_u, t_v, _ = surfels.frames()
     center, scale = surfels.column(mi.Point3f, "centers"), extent * surfels.column(mi.Vector2f, "scales")
     return [center + i * scale.x * t_u + j * scale.y * t_v for i, j in _CORNERS]
 
 
-def quads(corners):
-    """(positions, faces) of two triangles a surfel: surfel number i is face i // 2."""
+def quads(corners: "list[mi.Point3f]") -> "tuple[mi.Float, mi.UInt32]":
+    """Return the vertex positions and faces of a mesh of two triangles per surfel: face i is of surfel i // 2."""
     n = dr.width(corners)
     i = dr.arange(mi.UInt32, n)
     positions, faces = dr.empty(mi.Float, 12 * n), dr.empty(mi.UInt32, 6 * n)
@@ -31,16 +33,16 @@ def quads(corners):
 
 
 class Proxies:
-    """Where the surfels were when this was built, for rays to meet: each as the quad in which its alpha exceeds a
-    ``solid`` threshold; only those in the ``box``, where there is one.
+    """Where the surfels were when this was built, for rays to meet: each as the quad in which its alpha exceeds the
+    threshold ``solid``; only those in the ``box``, where there is one. Not differentiated.
 
-      scene      what rays meet: surfel number i is triangles 2 i and 2 i + 1
-      extent     half the width of each quad, in standard deviations, ``mi.Float``
-      normal     geometric normals, ``mi.Vector3f``
-      clearance  how far above the surface rays start, world units, ``mi.Float`` of width 1
+      scene      what rays meet: surfel i is the triangles 2 i and 2 i + 1
+      extent     half the width of each quad, in standard deviations
+      normal     geometric normals, world space
+      clearance  how far above the surface rays start, world units, of width 1
     """
 
-    def __init__(self, surfels: Surfels, solid=_SOLID, box=None):
+    def __init__(self, surfels: Surfels, solid: float = _SOLID, box: BoundingBox | None = None):
         with dr.suspend_grad():
             opacity = surfels.column(mi.Float, "opacities")
             if box is not None:
@@ -59,9 +61,11 @@ class Proxies:
             self.scene = mi.load_dict({"type": "scene", "proxies": mesh})
         self.two_sided = surfels.two_sided
 
-    def intersect(self, origin, normal, direction, active=True):
-        """(found, index, uv): whether the ray of an ``active`` lane meets the front of a surfel, which, and where on it
-        (see `Surfels.normals`). ``normal``: of the surface that the rays leave."""
+    def intersect(
+        self, origin: "mi.Point3f", normal: "mi.Vector3f", direction: "mi.Vector3f", active: "mi.Bool | bool" = True
+    ) -> "tuple[mi.Bool, mi.UInt32, mi.Point2f]":
+        """Return (found, index, uv): whether ``active`` rays meet the front of a surfel, which, and where on it (see
+        `Surfels.normals`). All vectors are in world space; ``normal`` is that of the surface that the rays leave."""
         with dr.suspend_grad():
             ray = mi.Ray3f(mi.Point3f(origin + self.clearance * normal), mi.Vector3f(direction))
             hit = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
@@ -73,8 +77,8 @@ class Proxies:
             return found, index, uv
 
     @staticmethod
-    def position(hit):
-        """(x, y) from −1 to 1 of a ray tracer's ``hit`` on its quad, along t_u and t_v."""
+    def position(hit: "mi.PreliminaryIntersection3f") -> "tuple[mi.Float, mi.Float]":
+        """Return where on its quad a ray tracer's ``hit`` is, (x, y) from −1 to 1 along t_u and t_v."""
         b_1, b_2 = hit.prim_uv
         first = (hit.prim_index & 1) == 0  # of `_TRIANGLES`: the corners 0 1 2, then 0 2 3
         return 2 * (dr.select(first, b_1 + b_2, b_1)) - 1, 2 * dr.select(first, b_2, b_1 + b_2) - 1

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..core.bounding_box import BoundingBox
 from ..splat.hit import fetch, pack
 from ..splat.tiles import Cutoffs
 from .proxies import Proxies
@@ -29,9 +30,14 @@ _SHAPE, _MATERIAL = 12, 8  # floats in a row
 
 @dataclass
 class SurfelIntersection:
-    """Where rays end on surfels, a lane each. ``found``: whether they do; ``t``: mean distance; ``normal``: unit mean of
-    n + Δn, world space; ``roughness``, ``metallic``, ``base_color``: means; ``index``: the surfel whose radiance they
-    bring."""
+    """Where rays end on surfels, one entry per ray.
+
+    found   whether they do
+    t       mean distance along the ray
+    normal  unit mean of n + Δn, world space, turned against the ray
+    roughness, metallic, base_color   means
+    index   the surfel whose radiance they bring
+    """
 
     found: "mi.Bool"
     t: "mi.Float"
@@ -43,10 +49,10 @@ class SurfelIntersection:
 
 
 class SurfelRayTracer:
-    """``surfels`` as rays meet them, those in the ``box`` where there is one; not differentiated. Its functions may be
-    called within symbolic loops."""
+    """Surfels as rays meet them, those in the ``box`` where there is one; not differentiated. Its methods may be called
+    within symbolic loops."""
 
-    def __init__(self, surfels: Surfels, box=None):
+    def __init__(self, surfels: Surfels, box: BoundingBox | None = None):
         with dr.suspend_grad():
             self.proxies = Proxies(surfels, _CUTOFFS.alpha_min, box)
             column = surfels.column
@@ -72,9 +78,11 @@ class SurfelRayTracer:
         self.two_sided = surfels.two_sided
 
     @dr.syntax
-    def intersect(self, ray, maxt, leaves, sample, active) -> SurfelIntersection:
-        """(10) along each ``ray`` up to the distance ``maxt``. ``leaves``: whether the ray comes from surfels (see
-        `_cross`); ``sample``: uniform random numbers that decide who is found."""
+    def intersect(
+        self, ray: "mi.Ray3f", maxt: "mi.Float", leaves: "mi.Bool", sample: "mi.Float", active: "mi.Bool"
+    ) -> SurfelIntersection:
+        """Intersect each world-space ``ray`` by (10) up to the distance ``maxt``. ``leaves`` says whether it comes from
+        surfels (see `_cross`); the uniform random numbers ``sample`` decide which surfel is found."""
         active, found = mi.Bool(active), mi.Bool(False)
         passed, remaining = mi.Float(0), mi.Float(1)
         index, last = mi.UInt32(0), mi.UInt32(_NONE)
@@ -109,8 +117,8 @@ class SurfelRayTracer:
         )
 
     @dr.syntax
-    def transmittance(self, ray, maxt, leaves, active):
-        """Π (1 − α_i) along each ``ray`` up to the distance ``maxt``, ``mi.Float``; see `intersect`."""
+    def transmittance(self, ray: "mi.Ray3f", maxt: "mi.Float", leaves: "mi.Bool", active: "mi.Bool") -> "mi.Float":
+        """Return Π (1 − α_i) along each ``ray`` up to the distance ``maxt``; see `intersect`."""
         active = mi.Bool(active)
         passed, remaining, last = mi.Float(0), mi.Float(1), mi.UInt32(_NONE)
         while active:
@@ -120,20 +128,21 @@ class SurfelRayTracer:
             active &= remaining > _CUTOFFS.transmittance_min
         return dr.select(remaining > _CUTOFFS.transmittance_min, remaining, 0)
 
-    def radiance(self, index, direction, active):
-        """Diffuse radiance that surfel ``index`` itself sends against ``direction``; see `Surfels.radiance`."""
+    def radiance(self, index: "mi.UInt32", direction: "mi.Vector3f", active: "mi.Bool") -> "mi.Color3f":
+        """Return the diffuse radiance that the surfel ``index`` itself sends against ``direction``; see
+        `Surfels.radiance`."""
         value = mi.Color3f(0.5)
         for k, Y in enumerate(dr.sh_eval(direction, sh_order(self.channels))):
             at = index * self.channels + 3 * k
             value += Y * mi.Color3f(*(dr.gather(mi.Float, self.sh, at + c, active) for c in range(3)))
         return dr.maximum(value, 0)
 
-    def above(self, point, normal):
-        """Where rays that leave surfels at ``point`` start: above their neighbours."""
+    def above(self, point: "mi.Point3f", normal: "mi.Vector3f") -> "mi.Point3f":
+        """Return where rays that leave surfels at ``point`` start: above their neighbours."""
         return point + self.proxies.clearance * normal
 
     def _cross(self, ray, passed, maxt, leaves, last, active):
-        """(whether there is a next crossing beyond the distance ``passed``, its distance, the surfel's number, α, and its
+        """(whether there is a next crossing beyond the distance ``passed``, its distance, the surfel's index, α, and its
         normal turned against the ray); α is 0 where the surfel does not show, or is the ``last`` one again.
 
         A ray that ``leaves`` surfels is not stopped by the backs of others near its start: these are of the same surface,

@@ -1,16 +1,17 @@
-"""Flat Gaussians that carry a principled material: the fields, their frames and their radiance.
+"""Flat Gaussians that carry a principled material: the fields, their frames and their radiance (docs/method.md §1).
 
-A surfel is the 2DGS primitive: a centre, two tangents with a standard deviation each, and an opacity. Its material has the
-names of Mitsuba's principled BSDF, so that a cloud of surfels is a principled material (`method.md` §1).
+A surfel is the primitive of 2DGS (Huang et al. 2024): a center, two tangents with a standard deviation each, and an opacity.
+Its material has the names of Mitsuba's principled BSDF, so that a cloud of surfels is a principled material.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-#: Channels of each field; `sh` has 3 (L+1)^2 of them, coefficient-major: sh[:, 3 k + c] is coefficient k of colour c.
+#: Channels of each field; `sh` has 3 (L+1)² of them, coefficient-major: sh[:, 3 k + c] is coefficient k of colour c.
 CHANNELS = {
     "centers": 3,
     "rotations": 4,
@@ -28,15 +29,16 @@ SH_0 = 0.28209479  # the spherical harmonic of order 0
 
 @dataclass
 class Surfels:
-    """N surfels. Every field is a ``mi.TensorXf`` of shape [N, channels] in its physical range.
+    """N surfels. Every field is a tensor of shape [N, channels] in its physical range.
 
-    centers       world space
-    rotations     unit quaternions (x, y, z, w); the columns of their matrix are the tangents t_u, t_v and the normal
+    centers       positions, world space
+    rotations     unit quaternions (x, y, z, w), the order of Mitsuba and Dr.Jit, while 3DGS's PLY columns rot_0 … rot_3 are
+                  (w, x, y, z); the columns of their matrix are the tangents t_u, t_v and the normal, world space
     scales        standard deviations along t_u and t_v, world units, > 0
     opacities     in (0, 1)
-    sh            diffuse radiance, linear: max(0, 1/2 + sum_k sh_k Y_k(d)), d from the camera to the centre (3DGS)
+    sh            diffuse radiance, linear: max(0, 1/2 + Σ_k sh_k Y_k(d)), d from the camera to the center (3DGS)
     base_color, roughness, metallic   principled BSDF parameters in [0, 1]
-    delta_normal  the residual Δn that is added to the normal (RGS, eq. of N)
+    delta_normal  the residual Δn that is added to the normal (RGS), world space
     curvature     K_uu, K_uv, K_vv: how the normal turns across the surfel, radians per √(s_u s_v); see `normal_derivatives`
     two_sided     whether surfels show from behind, with the normal turned to the camera (2DGS); one-sided ones, whose
                   normals point outwards, keep the far side of a closed object from bending its silhouette's normals
@@ -54,23 +56,25 @@ class Surfels:
     curvature: "mi.TensorXf"
     two_sided: bool = True
 
-    def __len__(self):
+    def __len__(self) -> int:
         return self.centers.shape[0]
 
     @classmethod
-    def from_numpy(cls, arrays: dict, two_sided=True) -> "Surfels":
-        """From float32 arrays, one a field; without ``curvature`` normals are the same all over each surfel."""
+    def from_numpy(cls, arrays: dict[str, np.ndarray], two_sided: bool = True) -> "Surfels":
+        """Make surfels of arrays [N, channels] by the names of the fields; without ``curvature`` normals are the same all
+        over each surfel."""
         arrays = {"curvature": np.zeros((len(arrays["centers"]), 3))} | arrays
         return cls(
             **{name: mi.TensorXf(np.ascontiguousarray(arrays[name], np.float32)) for name in CHANNELS}, two_sided=two_sided
         )
 
     def numpy(self) -> dict[str, np.ndarray]:
-        """One float32 array a field, detached."""
+        """Return each field as a float32 array [N, channels], detached."""
         return {name: dr.detach(getattr(self, name)).numpy() for name in CHANNELS}
 
-    def column(self, kind, name):
-        """Field ``name`` as a Dr.Jit array with one lane a surfel, e.g. ``column(mi.Point3f, "centers")``."""
+    def column(self, kind: type, name: str) -> Any:
+        """Return the field ``name`` as a Dr.Jit array of type ``kind`` and width N, e.g. ``column(mi.Point3f, "centers")``;
+        differentiable."""
         tensor = getattr(self, name)
         if kind is mi.Float:
             return self._gather(tensor, 0)
@@ -82,8 +86,8 @@ class Surfels:
         index = dr.arange(mi.UInt32, len(self)) * tensor.shape[1] + k
         return dr.gather(mi.Float, tensor.array, index, mode=dr.ReduceMode.NoConflicts)
 
-    def take(self, index) -> "Surfels":
-        """The surfels ``index`` (``mi.UInt32``, repeats allowed)."""
+    def take(self, index: "mi.UInt32") -> "Surfels":
+        """Return the surfels ``index``, of which some may repeat; differentiable."""
 
         def rows(tensor):
             count, channels = dr.width(index), tensor.shape[1]
@@ -91,18 +95,18 @@ class Surfels:
             source = dr.gather(mi.UInt32, index, entry // channels) * channels + entry % channels
             return mi.TensorXf(dr.gather(mi.Float, tensor.array, source, mode=dr.ReduceMode.Local), (count, channels))
 
-        return Surfels(*(rows(getattr(self, name)) for name in CHANNELS), self.two_sided)
+        return Surfels(**{name: rows(getattr(self, name)) for name in CHANNELS}, two_sided=self.two_sided)
 
-    def frames(self):
-        """(t_u, t_v, n): unit tangents and normal of every surfel in world space, each ``mi.Vector3f`` of width N."""
+    def frames(self) -> "tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]":
+        """Return (t_u, t_v, n), the unit tangents and normal of every surfel in world space, each of width N."""
         x, y, z, w = dr.normalize(self.column(mi.Vector4f, "rotations"))
         t_u = mi.Vector3f(1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w))
         t_v = mi.Vector3f(2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w))
         n = mi.Vector3f(2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y))
         return t_u, t_v, n
 
-    def normal_derivatives(self):
-        """(∂n/∂u, ∂n/∂v), each ``mi.Vector3f`` of width N: u and v standard deviations from the centre the normal is
+    def normal_derivatives(self) -> "tuple[mi.Vector3f, mi.Vector3f]":
+        """Return (∂n/∂u, ∂n/∂v) in world space, each of width N. At (u, v) standard deviations from the center the normal is
         n + u ∂n/∂u + v ∂n/∂v, as on a surface whose curvature tensor is K / √(s_u s_v). The surfel itself stays flat.
 
             ∂n/∂u = √(s_u/s_v) (K_uu t_u + K_uv t_v),   ∂n/∂v = √(s_v/s_u) (K_uv t_u + K_vv t_v)
@@ -112,17 +116,18 @@ class Surfels:
         ratio = dr.sqrt(scales.x / scales.y)
         return ratio * (K.x * t_u + K.y * t_v), (K.y * t_u + K.z * t_v) / ratio
 
-    def normals(self, uv=None):
-        """Unit normals n + Δn in world space, ``mi.Vector3f`` of width N, in the middle of the surfels; with ``uv``
-        (``mi.Point2f``: u, v in standard deviations from there) as turned as they are there."""
+    def normals(self, uv: "mi.Point2f | None" = None) -> "mi.Vector3f":
+        """Return the unit normals n + Δn in world space, of width N, at the centers of the surfels, or at ``uv`` in standard
+        deviations from these."""
         normal = self.frames()[2] + self.column(mi.Vector3f, "delta_normal")
         if uv is not None:
             dn_du, dn_dv = self.normal_derivatives()
             normal = normal + uv.x * dn_du + uv.y * dn_dv
         return dr.normalize(normal)
 
-    def radiance(self, direction):
-        """Diffuse radiance of every surfel seen along unit ``direction`` (from the camera), ``mi.Color3f`` of width N."""
+    def radiance(self, direction: "mi.Vector3f") -> "mi.Color3f":
+        """Return the diffuse radiance (linear) of every surfel seen along the world-space unit ``direction`` from the camera,
+        of width N."""
         basis = dr.sh_eval(direction, sh_order(self.sh.shape[1]))
         value = mi.Color3f(0.5)
         for k, Y in enumerate(basis):
@@ -131,12 +136,13 @@ class Surfels:
 
 
 def sh_order(channels: int) -> int:
-    """Order L of spherical harmonics stored in ``channels`` = 3 (L+1)^2 numbers."""
+    """Return the order L of spherical harmonics stored in ``channels`` = 3 (L+1)² numbers."""
     return round((channels / 3) ** 0.5) - 1
 
 
 def rotation_from_normal(normal: np.ndarray, spin: np.ndarray | float = 0.0) -> np.ndarray:
-    """Quaternions [N, 4] (x, y, z, w) that turn +z to unit ``normal`` [N, 3], after a turn by ``spin`` radians about z."""
+    """Return quaternions [N, 4] (x, y, z, w) that turn +z to unit ``normal`` [N, 3], after a turn by ``spin`` radians ([N] or
+    one number) about z."""
     x, y, z = np.asarray(normal, np.float64).T
     half = np.stack([-y, x, np.zeros_like(x), 1 + z], 1)
     half[z < -0.999999] = [1, 0, 0, 0]

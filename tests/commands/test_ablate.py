@@ -17,8 +17,6 @@ from rgs_mi.core import subprocesses
 from rgs_mi.core.errors import UserError
 from rgs_mi.fit.scene import FitScene
 from rgs_mi.report import comparison, results
-from rgs_mi.settings.config import completed, to_dict
-from rgs_mi.settings.settings import Settings
 
 from runs import PATIENCE, ROOT, TARGET, make_suite, start, start_script, wait_for
 
@@ -113,17 +111,6 @@ def test_mistakes(suite, tmp_path, options, message):
     with pytest.raises(UserError, match=message):
         call(suite, tmp_path, **options)
     assert not list(tmp_path.iterdir())
-
-
-def test_settings_younger_than_a_fit(suite):
-    now = to_dict(settings(suite, "full"))
-    before = json.loads(json.dumps(now))
-    del before["density"]["guided"]
-    assert not completed(Settings, before) == now  # `full` has it other than the default is
-    del before["specular_start"]
-    before["density"]["guided"] = True
-    assert completed(Settings, before) == now
-    assert not completed(Settings, before | {"sh_order": 0}) == now
 
 
 # ---- Fits ----
