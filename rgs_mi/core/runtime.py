@@ -1,4 +1,4 @@
-"""Finds an LLVM that works and sets Mitsuba's variant: the only module that touches environment variables.
+"""Finds an LLVM that works, sets Mitsuba's variant: the only module that touches the environment.
 
 Dr.Jit's CPU backend loads libLLVM at run time. Version 15 loads and then aborts the process in ``dr.clip``; older ones
 are refused with a misleading message. On Linux x86-64 the wheel ``karellen-llvm-core`` brings a recent one into the

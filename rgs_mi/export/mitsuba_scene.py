@@ -3,12 +3,19 @@
 import copy
 import warnings
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
 from ..core.files import atomic_file, write_exr
+from ..datasets.types import View
+from ..shading.deferred import Shading
+from ..shading.environment import Environment
+from ..shading.shader import Shader
 from ..surfels.ply import write_ply
+from ..surfels.surfels import Surfels
 
 SURFELS, ENVIRONMENT, SHADER, SCENE = "object.ply", "environment.exr", "shader.npz", "scene.xml"
 
