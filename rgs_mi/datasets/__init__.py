@@ -9,7 +9,7 @@ from .types import Dataset
 _LAYOUTS = blender, nerfstudio, colmap, nero  # the first that fits is the one
 
 
-def load_dataset(root: Path) -> Dataset:
+def load_dataset(root: str | Path) -> Dataset:
     """Load the capture in folder ``root``, in the first layout that it has: `blender`, `nerfstudio`, `colmap`, `nero`.
 
     World and cameras stay as in the files. Photographs of lenses with distortion are made those of pinholes
@@ -26,10 +26,10 @@ def load_dataset(root: Path) -> Dataset:
 
 
 def is_capture(root: Path) -> bool:
-    """Whether ``root`` is a folder with one of the layouts of `load_dataset`; what is in its files is not asked."""
+    """Return whether ``root`` is a folder with one of the layouts of `load_dataset`; what is in its files is not asked."""
     return root.is_dir() and any(layout.found(root) for layout in _LAYOUTS)
 
 
 def looked_for() -> str:
-    """The files that tell a capture, in words."""
+    """Return the files that tell a capture, in words."""
     return "; ".join(layout.LOOKED_FOR for layout in _LAYOUTS)

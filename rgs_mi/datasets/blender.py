@@ -23,7 +23,7 @@ LOOKED_FOR = f"{TRAIN} (Blender)"
 
 
 def found(root: Path) -> bool:
-    """Whether folder ``root`` has this layout."""
+    """Return whether folder ``root`` has this layout."""
     return (root / TRAIN).is_file()
 
 

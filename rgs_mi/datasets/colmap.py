@@ -28,14 +28,16 @@ _REMEDY = "COLMAP's pose must be a rotation and a near translation"
 
 
 def found(root: Path) -> bool:
-    """Whether folder ``root`` has this layout."""
+    """Return whether folder ``root`` has this layout."""
     return _model(root) is not None
 
 
 def load(root: Path) -> Dataset:
     """Load a capture. Photographs that are not there and views with an empty mask are left out, each kind with one
     warning. Raises: UserError for anything in the folder that cannot be used, naming the file."""
-    model, suffix = _model(root)
+    files = _model(root)
+    assert files is not None, "found() says that they are there"
+    model, suffix = files
     images = read_model(root / model, suffix)
     source = root / model / f"images{suffix}"
     folder = chosen(root / "images", max(max(image.lens.size) for image in images))

@@ -40,7 +40,8 @@ _MOST_EXTREME = 1e8  # of a camera's numbers; what lies beyond is damage
 
 @dataclass(frozen=True)
 class Lens:
-    """One camera of the model: (fx, fy), (cx, cy), (width, height) in pixels, and its distortion."""
+    """One camera of the model: ``focal`` (fx, fy), ``principal`` (cx, cy) and ``size`` (width, height) in pixels, and its
+    ``distortion``."""
 
     focal: tuple[float, float]
     principal: tuple[float, float]
@@ -50,7 +51,8 @@ class Lens:
 
 @dataclass(frozen=True)
 class Image:
-    """One registered image: ``to_camera`` [4, 4] takes world to camera space."""
+    """One registered image, its ``name`` and ``lens``; ``to_camera`` [4, 4] takes world to camera space (x right, y down, z
+    forward)."""
 
     name: str
     lens: Lens
@@ -58,7 +60,7 @@ class Image:
 
 
 def read_model(folder: Path, suffix: str) -> list[Image]:
-    """The registered images of the model in ``folder``, whose files end in ``suffix`` (".bin" or ".txt").
+    """Return the registered images of the model in ``folder``, whose files end in ``suffix`` (".bin" or ".txt").
 
     Raises: UserError for missing and damaged files, and for lenses that are no perspective ones.
     """

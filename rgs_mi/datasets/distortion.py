@@ -26,18 +26,18 @@ _SRGB_TO_LINEAR = srgb_decode(np.arange(256) / 255).astype(np.float32)
 
 @dataclass(frozen=True)
 class Distortion:
-    """Coefficients: ``radial`` k1, k2 … and ``denominator`` m1, m2 … of even powers of r, ``tangential`` p1, p2. False
-    where all are zero."""
+    """The coefficients of a lens: ``radial`` k1, k2 … and ``denominator`` m1, m2 … of even powers of r, ``tangential`` p1,
+    p2. It is false where all are zero."""
 
     radial: tuple[float, ...] = ()
     denominator: tuple[float, ...] = ()
     tangential: tuple[float, float] = (0.0, 0.0)
 
-    def __bool__(self):
+    def __bool__(self) -> bool:
         return any((*self.radial, *self.denominator, *self.tangential))
 
     def apply(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pinhole coordinates (x, y), of any shape, to distorted ones; NaN where the lens shows nothing."""
+        """Take pinhole coordinates (x, y), of any shape, to distorted ones; NaN where the lens shows nothing."""
         p1, p2 = self.tangential
         r2 = x**2 + y**2
         factor = np.where(r2 < self._reach(np.sqrt(r2.max())) ** 2, self._factor(r2), np.nan)
@@ -51,11 +51,11 @@ class Distortion:
         """The radius up to which r R(r²) grows. Beyond it a polynomial runs back: it would show the image again."""
         r = np.linspace(0, farthest * 1.01, 4096)
         growing = np.diff(r * self._factor(r**2)) > 0  # False for NaN
-        return np.inf if growing.all() else r[growing.argmin()]
+        return np.inf if growing.all() else float(r[growing.argmin()])
 
 
 def undistorted(pixels: np.ndarray, camera: Camera, distortion: Distortion, name: str) -> np.ndarray:
-    """`View.pixels` as the pinhole ``camera`` sees them, [H, W, 4] of the same type.
+    """Return `View.pixels` as the pinhole ``camera`` sees them, [H, W, 4] of the same type.
 
     Bilinear, in linear light, weighted with alpha. Where the photograph shows nothing alpha is 0. The result is kept in
     `cache_folder` and found again by the pixels, the camera, the coefficients and the view's ``name``.
@@ -74,8 +74,8 @@ def undistorted(pixels: np.ndarray, camera: Camera, distortion: Distortion, name
 
 
 def cropped_to_valid(pixels: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:
-    """The window of a photograph that has alpha everywhere, and its camera: cut row by row and column by column, each time
-    the side that lacks most."""
+    """Return the window of a photograph that has alpha everywhere, and its camera: cut row by row and column by column, each
+    time the side that lacks most."""
     lacks = pixels[..., 3] == 0
     top, left, bottom, right = 0, 0, *lacks.shape
     while (window := lacks[top:bottom, left:right]).any():

@@ -28,7 +28,8 @@ class Frame:
       where:      begins error messages: the file that names it, and its place there
       name:       `View.name`
       path:       the image file, or what was looked for where it is ``missing``
-      camera:     the image's (width, height) to its `Camera`; may raise a UserError
+      camera:     callback that returns the image's `Camera` from its (width, height), or raises a UserError; None where the
+                  image is ``missing``
       distortion: of the lens, which is taken out of the photograph (`distortion.undistorted`)
       mask:       gives the coverage [h, w] of a photograph without alpha of its own, in [0, 1] and of any size; or None
       normal:     the file of its normals (`images.read_normal`), or None
@@ -37,7 +38,7 @@ class Frame:
     where: str
     name: str
     path: Path
-    camera: Callable[[tuple[int, int]], Camera]
+    camera: Callable[[tuple[int, int]], Camera] | None
     distortion: Distortion = Distortion()
     mask: Callable[[], np.ndarray] | None = None
     normal: Path | None = None
@@ -45,7 +46,7 @@ class Frame:
 
 
 def load_views(source: Path, frames: list[Frame]) -> list[View]:
-    """The usable views of ``frames``, which ``source`` names. Frames without an image file and views with an empty mask
+    """Load the usable views of ``frames``, which ``source`` names. Frames without an image file and views with an empty mask
     are left out, each kind with one warning.
 
     Raises: UserError for a bad image, mask or camera, for two frames of one name, and where no view is left.
@@ -82,7 +83,7 @@ def load_views(source: Path, frames: list[Frame]) -> list[View]:
 
 
 def load_split(source: Path, frames: list[Frame], held_out: set[str]) -> dict[str, list[View]]:
-    """`load_views` as the lists ``train`` and ``test`` of `Dataset`; ``held_out`` are the names of test views.
+    """Load views as the lists ``train`` and ``test`` of `Dataset`; ``held_out`` are the names of test views.
 
     Raises: UserError where no view is left to train with.
     """
@@ -94,12 +95,12 @@ def load_split(source: Path, frames: list[Frame], held_out: set[str]) -> dict[st
 
 
 def every_eighth(names: list[str]) -> set[str]:
-    """The names held out where a layout has no split of its own: numbers 0, 8, 16 … of ``names`` in their order."""
+    """Return the names held out where a layout has no split of its own: 0, 8, 16 … of ``names`` in their order."""
     return set(names[::HOLD_OUT]) if len(names) > 1 else set()
 
 
 def rigid(matrix: np.ndarray, where: str, remedy: str) -> np.ndarray:
-    """``matrix`` [4, 4], a pose whose numbers were rounded, with its rotation made exact.
+    """Return ``matrix`` [4, 4], a pose whose numbers were rounded, with its rotation made exact.
 
     Raises: UserError where it is not finite, scales, shears, mirrors, or lies beyond `FARTHEST`.
     """
@@ -120,8 +121,16 @@ def rigid(matrix: np.ndarray, where: str, remedy: str) -> np.ndarray:
     return matrix
 
 
-def pinhole(to_world, focal, principal, size, photograph: tuple[int, int], where: str) -> Camera:
-    """The camera of a ``photograph`` (width, height) that may be a resize of the ``size`` it was calibrated for.
+def pinhole(
+    to_world: np.ndarray,
+    focal: tuple[float, float],
+    principal: tuple[float, float],
+    size: tuple[int, int],
+    photograph: tuple[int, int],
+    where: str,
+) -> Camera:
+    """Return the camera of a ``photograph`` (width, height) that may be a resize of the ``size`` it was calibrated for;
+    ``to_world``, ``focal`` and ``principal`` are those of `Camera`, and ``where`` begins error messages.
 
     Raises: UserError for numbers out of range and other proportions.
     """
@@ -136,14 +145,16 @@ def pinhole(to_world, focal, principal, size, photograph: tuple[int, int], where
                 f"give pixels between {lower:g} and {upper:g}"
             )
     check_proportions(size, photograph, f"{where}: its camera")
-    return Camera(to_world, tuple(map(float, focal)), tuple(map(float, principal)), tuple(size)).resized(*photograph)
+    floats = lambda pair: (float(pair[0]), float(pair[1]))
+    return Camera(to_world, floats(focal), floats(principal), (size[0], size[1])).resized(*photograph)
 
 
 def _load_view(frame: Frame) -> View:
     pixels, masked = read_image(frame.path, frame.where)
     if frame.mask and not masked:
         pixels, masked = with_mask(pixels, frame.mask(), frame.where)
-    camera = frame.camera(pixels.shape[1::-1])
+    assert frame.camera is not None, "its image is there"
+    camera = frame.camera((pixels.shape[1], pixels.shape[0]))
     if frame.distortion:
         pixels = undistorted(pixels, camera, frame.distortion, frame.name)
         if not masked:

@@ -15,7 +15,7 @@ _ASPECT = 0.05  # how far proportions may be off: small images round their sizes
 
 
 def read_image(path: Path, where: str) -> tuple[np.ndarray, bool]:
-    """A photograph as `View.pixels`, and whether it has a mask (an alpha channel that is not opaque everywhere).
+    """Read a photograph as `View.pixels`, and whether it has a mask (an alpha channel that is not opaque everywhere).
 
     16-bit PNGs keep their high bytes. EXR files are linear with premultiplied alpha, as the format has it; ``where``
     begins the message. Raises: UserError when the file is damaged, empty, too large, or holds NaN or infinity.
@@ -28,15 +28,16 @@ def read_image(path: Path, where: str) -> tuple[np.ndarray, bool]:
 
 
 def read_grey(path: Path, where: str) -> np.ndarray:
-    """[H, W] float32 in [0, 1]: the alpha channel of an image where that is not opaque everywhere, else its grey level, as
-    the file encodes it (no sRGB curve), of 16 bits where there are 16. Raises: UserError as `read_image` does."""
+    """Read an image's alpha channel where that is not opaque everywhere, else its grey level, as the file encodes it (no sRGB
+    curve), of 16 bits where there are 16: [H, W] float32 in [0, 1]. Raises: UserError as `read_image` does."""
     grey = _decoded(_read_grey, path, where)
     return grey.astype(np.float32) / np.float32(255 if grey.dtype == np.uint8 else 65535)
 
 
 def with_mask(pixels: np.ndarray, coverage: np.ndarray, where: str) -> tuple[np.ndarray, bool]:
-    """A photograph without alpha [H, W, 4] under a mask [h, w] (values in [0, 1], resized where its size is another), and
-    whether that masks anything. Raises: UserError where the mask's proportions are other than the photograph's."""
+    """Put a photograph without alpha [H, W, 4] under a mask ``coverage`` [h, w] (values in [0, 1], resized where its size is
+    another); return it, and whether anything is masked. Raises: UserError where the mask's proportions are other than the
+    photograph's."""
     from PIL import Image
 
     height, width = pixels.shape[:2]
@@ -47,8 +48,8 @@ def with_mask(pixels: np.ndarray, coverage: np.ndarray, where: str) -> tuple[np.
     return pixels, bool((coverage < 1).any())
 
 
-def check_proportions(size: tuple[float, float], photograph: tuple[int, int], what: str):
-    """Raises: UserError where ``what``, of ``size`` (width, height), cannot be a ``photograph`` of another resolution."""
+def check_proportions(size: tuple[float, float], photograph: tuple[int, int], what: str) -> None:
+    """Check that ``what``, of ``size`` (width, height), can be a ``photograph`` of another resolution. Raises: UserError."""
     if abs(size[0] * photograph[1] / (size[1] * photograph[0]) - 1) > _ASPECT:
         raise UserError(
             f"{what} is {size[0]:g} x {size[1]:g}, the photograph {photograph[0]} x {photograph[1]}: both must "
@@ -124,8 +125,8 @@ def _read_exr(path: Path) -> tuple[np.ndarray, bool]:
     return pixels, alpha is not None
 
 
-def check_size(width: int, height: int):
-    """Raises: ValueError for a size that no image has."""
+def check_size(width: int, height: int) -> None:
+    """Check that an image can have this size in pixels. Raises: ValueError."""
     if width < 1 or height < 1:
         raise ValueError("its size is zero")
     if width * height > MAX_PIXELS:
@@ -133,7 +134,7 @@ def check_size(width: int, height: int):
 
 
 def read_normal(path: Path, pixels: np.ndarray, where: str) -> np.ndarray:
-    """[H, W, 3] world-space unit normals that belong to a photograph; 0 where unknown.
+    """Read the world-space unit normals [H, W, 3] float32 that belong to a photograph; 0 where unknown.
 
     ``_normal.png`` (Shiny Blender) holds n/2 + 1/2 and is known where neither its own alpha is zero nor it is black,
     which no unit normal is. ``_normal_0001.png`` (NeRF Synthetic) holds n itself, cut to [0, 1]
@@ -156,7 +157,7 @@ def read_normal(path: Path, pixels: np.ndarray, where: str) -> np.ndarray:
 
 
 def resize(values: np.ndarray, height: int, width: int) -> np.ndarray:
-    """A map [h, w] on another pixel grid over the same image plane: [height, width] float32.
+    """Put a map [h, w] on another pixel grid over the same image plane: [height, width] float32.
 
     Bilinear between those of the four neighbours that are known, unknown (NaN) where the nearest one is. A smaller grid
     takes samples, not means, which would mix the object with what lies behind it.

@@ -29,7 +29,7 @@ _REMEDY = "a camera is a pickle of a rigid world-to-camera matrix [3, 4] and K [
 
 
 def found(root: Path) -> bool:
-    """Whether folder ``root`` has this layout."""
+    """Return whether folder ``root`` has this layout."""
     return any(root.glob(f"?*{CAMERA}"))
 
 

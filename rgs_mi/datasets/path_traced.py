@@ -1,4 +1,4 @@
-"""Path-traced truth: any Mitsuba scene becomes a data set in the Blender layout (NeRF Synthetic, Shiny Blender).
+"""Path-traced ground truth: any Mitsuba scene becomes a data set in the Blender layout (NeRF Synthetic, Shiny Blender).
 
     transforms_train.json, transforms_test.json    camera_angle_x (radians), frames[].transform_matrix: camera to world,
                                                    camera x right, y up, looking along -z
@@ -21,13 +21,18 @@ import math
 import os
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..core.camera import Camera, opaque, pixel_directions
+from ..core.color import srgb_encode, to_8bit
 from ..core.errors import UserError
 from ..core.progress import Progress
 from ..core.scene_files import load_scene
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 FOV = 39.6  # degrees, Blender's default camera (0.691 rad)
 MARGIN = 1.02  # keeps the object's bounding sphere off the frame
@@ -53,14 +58,15 @@ _CV_TO_BLENDER = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def train_directions(count: int, seed: int = 0) -> np.ndarray:
-    """[count, 3] unit directions from the object to the cameras: a Fibonacci lattice from -12 degrees to the zenith."""
+    """Return unit directions [count, 3] from the object to the cameras: a Fibonacci lattice from −12 degrees to the
+    zenith."""
     i = np.arange(count)
     z = math.sin(math.radians(-12)) + (0.995 - math.sin(math.radians(-12))) * (i + 0.5) / count
     return _direction(_GOLDEN * i + seed, z)
 
 
 def test_directions(count: int, seed: int = 0) -> np.ndarray:
-    """[count, 3] unit directions on a spiral of three turns that climbs from -6 to 65 degrees."""
+    """Return unit directions [count, 3] on a spiral of three turns that climbs from −6 to 65 degrees."""
     t = (np.arange(count) + 0.5) / count
     return _direction(6 * math.pi * t + 0.7 + seed, np.sin(np.radians(-6 + 71 * t)))
 
@@ -73,8 +79,8 @@ def _direction(azimuth, z):
     return np.stack([r * np.cos(azimuth), r * np.sin(azimuth), z], -1)
 
 
-def bounds(scene) -> tuple[np.ndarray, float]:
-    """Centre [3] of the scene's bounding box and the radius of a sphere around it that holds every shape.
+def bounds(scene: "mi.Scene") -> tuple[np.ndarray, float]:
+    """Return the center [3] of the scene's bounding box and the radius of a sphere around it that holds every shape.
 
     Raises: UserError when the scene holds no geometry.
     """
@@ -105,7 +111,7 @@ def _farthest(shape, point: np.ndarray) -> float:
 class Renderer:
     """A loaded scene and one camera that moves: kernels are compiled for the first view only."""
 
-    def __init__(self, scene, size: int):
+    def __init__(self, scene: "mi.Scene", size: int):
         import mitsuba as mi
 
         camera = Camera.look_at((1, 0, 0), (0, 0, 0), (0, 0, 1), FOV, (size, size))
@@ -116,7 +122,7 @@ class Renderer:
         self.params = mi.traverse(self.sensor)
 
     def radiance(self, camera: Camera, spp: int, seed: int) -> np.ndarray:
-        """[H, W, 4] float32 linear radiance, premultiplied, by the scene's integrator."""
+        """Render linear radiance by the scene's integrator, [H, W, 4] float32, premultiplied."""
         import mitsuba as mi
 
         self.params["to_world"] = camera.to_sensor_dict()["to_world"]
@@ -124,7 +130,7 @@ class Renderer:
         return np.array(mi.render(self.scene, sensor=self.sensor, spp=spp, seed=seed))
 
     def aov(self, camera: Camera) -> np.ndarray:
-        """[H, W, 10] float32 maps in the order of `AOV_CHANNELS`, from a regular grid of samples in each pixel."""
+        """Render the maps in the order of `AOV_CHANNELS`, [H, W, 10] float32, from a regular grid of samples in each pixel."""
         import drjit as dr
         import mitsuba as mi
 
@@ -151,16 +157,6 @@ class Renderer:
         return maps.reshape(height, width, -1)
 
 
-def srgb(linear: np.ndarray) -> np.ndarray:
-    """Linear radiance to sRGB in [0, 1] (IEC 61966-2-1)."""
-    x = np.clip(linear, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
-
-
-def _to_8bit(x: np.ndarray) -> np.ndarray:
-    return np.uint8(np.clip(x, 0, 1) * 255 + 0.5)
-
-
 def _write(path: Path, bitmap):
     """Write a bitmap so that ``path`` is there whole or not at all."""
     temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
@@ -180,8 +176,8 @@ def _write_view(stem: Path, rgba: np.ndarray, aov: np.ndarray):
     alpha = rgba[..., 3:]
     straight = rgba[..., :3] / np.maximum(alpha, 1e-6)
     half, formats = mi.Struct.Type.Float16, mi.Bitmap.PixelFormat
-    encoded = _to_8bit(np.concatenate([aov[..., 1:4] * 0.5 + 0.5, aov[..., 9:]], -1)) * (aov[..., 9:] > 0)
-    photograph = _to_8bit(np.concatenate([srgb(straight), alpha], -1))
+    encoded = to_8bit(np.concatenate([aov[..., 1:4] * 0.5 + 0.5, aov[..., 9:]], -1)) * (aov[..., 9:] > 0)
+    photograph = to_8bit(np.concatenate([srgb_encode(np.clip(straight, 0, 1)), alpha], -1))
     _write(stem.with_name(stem.name + "_aov.exr"), mi.Bitmap(aov, formats.MultiChannel, list(AOV_CHANNELS)))
     _write(stem.with_name(stem.name + "_normal.png"), mi.Bitmap(encoded, formats.RGBA))
     _write(stem.with_suffix(".exr"), mi.Bitmap(rgba, formats.RGBA).convert(component_format=half))
@@ -206,10 +202,15 @@ def _digest(path: Path, seen: set) -> str:
 
 
 def _code_digest() -> str:
-    """A hash of the code that decides what the pictures show."""
-    package = Path(__file__).parents[1]
-    procedural = importlib.util.find_spec("rgs_mi.plugins.procedural").origin
-    files = [Path(__file__), package / "core" / "camera.py", Path(procedural), *sorted((package / "targets").glob("*.py"))]
+    """A hash of the code that decides what the images show."""
+    package, procedural = Path(__file__).parents[1], importlib.util.find_spec("rgs_mi.plugins.procedural")
+    assert procedural is not None and procedural.origin is not None, "it is a file of this package"
+    files = [
+        Path(__file__),
+        package / "core" / "camera.py",
+        Path(procedural.origin),
+        *sorted((package / "targets").glob("*.py")),
+    ]
     return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()
 
 
@@ -257,15 +258,15 @@ def _frame(split: str, index: int, camera: Camera) -> dict:
 
 
 def render_dataset(
-    xml,
-    out,
+    xml: str | Path,
+    out: str | Path,
     *,
     train: int = 60,
     test: int = 20,
     size: int = 400,
     spp: int = 25,
     radius: float | None = None,
-    variables: dict | None = None,
+    variables: dict[str, object] | None = None,
     seed: int = 0,
     quiet: bool = False,
 ) -> Path:
@@ -273,9 +274,9 @@ def render_dataset(
 
     Args:
       xml: scene file; variables: its ``<default>``s to override
-      out: folder to write; train, test: numbers of views; size: pixels along the side of the square pictures
+      out: folder to write; train, test: how many views; size: pixels along the side of the square images
       spp: samples per pixel of the training views; test views take `TEST_SPP` times as many. Rounded up to a grid.
-      radius: distance of the cameras from the centre of the scene's bounding box; None fits the object into the frame
+      radius: distance of the cameras from the center of the scene's bounding box; None fits the object into the frame
       seed: turns the cameras around the object and reseeds the sampler
 
     Returns: ``out`` as a Path. Needs an active variant.
@@ -315,12 +316,12 @@ def render_dataset(
     views = [(split, i, camera) for split, cs in cameras.items() for i, camera in enumerate(cs)]
     renderer = Renderer(scene, size)
     with Progress(quiet=quiet, label=f"rendering {xml.name}") as progress:
-        for number, (split, i, camera) in enumerate(views):
+        for index, (split, i, camera) in enumerate(views):
             stem = out / split / f"r_{i}"
             if not stem.with_suffix(".png").is_file():
                 samples = spp * (TEST_SPP if split == "test" else 1)
-                _write_view(stem, renderer.radiance(camera, samples, seed * len(views) + number), renderer.aov(camera))
-            progress.update((number + 1) / len(views), views=number + 1)
+                _write_view(stem, renderer.radiance(camera, samples, seed * len(views) + index), renderer.aov(camera))
+            progress.update((index + 1) / len(views), views=index + 1)
     for split, cs in cameras.items():
         frames = [_frame(split, i, camera) for i, camera in enumerate(cs)]
         _write_json(out / f"transforms_{split}.json", {"camera_angle_x": math.radians(FOV), "frames": frames})

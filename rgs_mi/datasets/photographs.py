@@ -1,5 +1,6 @@
 """The photographs as a fit looks at them: levels of a pyramid, windows around the object."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mitsuba as mi
@@ -7,19 +8,27 @@ import numpy as np
 from skimage.transform import downscale_local_mean
 
 from ..core.arrays import as_float
+from ..core.camera import Camera
 from ..core.color import display
 from .images import resize
+from .types import DepthPrior, View
 
 _CROP_MARGIN = 8  # pixels of background around the object that training looks at
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """One photograph, or the window of it around the object. ``color``, ``alpha``: display values over the background, and
-    coverage; ``prior``: depth up to scale and shift, NaN where unknown, or None, and whether it is ``inverse``; a lane a
-    pixel. ``size``: (width, height) of the whole photograph."""
+    """One photograph, or the window of it around the object, with one entry per pixel.
 
-    camera: object
+    camera   that of the window
+    color    display values over the background
+    alpha    coverage
+    prior    depth up to scale and shift, NaN where unknown; or None
+    inverse  whether the prior is one of inverse depth
+    size     (width, height) of the whole photograph
+    """
+
+    camera: Camera
     color: "mi.Color3f"
     alpha: "mi.Float"
     prior: "mi.Float | None"
@@ -30,15 +39,24 @@ class Photograph:
 class Photographs:
     """The training photographs of one pyramid level as the losses want them: display space, over the background, and
     cropped to windows of one size that hold the object in every view (one size, since each needs its own kernels).
-    ``priors``: a `DepthPrior` a view, or None."""
 
-    def __init__(self, views, downscale, background, priors=None):
+    ``downscale`` is how many pixels of a view's side make one of the level's; ``background`` a display value; ``priors`` has
+    one entry per view.
+    """
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        downscale: int,
+        background: float,
+        priors: Sequence[DepthPrior] | None = None,
+    ):
         self.views, self.downscale, self.background, self.priors = views, downscale, background, priors
         self._images = {}
         self._windows = _windows(views, downscale)
 
-    def __getitem__(self, i) -> Photograph:
-        """View ``i``."""
+    def __getitem__(self, i: int) -> Photograph:
+        """The photograph of view ``i``."""
         camera, (x, y, width, height) = self.views[i].camera, self._windows[i]
         if i not in self._images:
             whole = self._whole(i)
@@ -66,7 +84,7 @@ class Photographs:
 
 
 def _windows(views, downscale):
-    """One (x, y, width, height) a view, in pixels of the level: around the mask, of one size where photographs are."""
+    """(x, y, width, height) of each view, in pixels of the level: around the mask, of one size where photographs are."""
     sizes = [tuple(max(n // downscale, 1) if n >= downscale else n for n in v.camera.size) for v in views]
     if len(set(sizes)) > 1 or not all(v.masked for v in views):
         return [(0, 0, *size) for size in sizes]

@@ -12,7 +12,8 @@ LONGEST = 1600
 
 
 def chosen(folder: Path, longest: float) -> Path:
-    """``folder`` or the smaller copy beside it, for photographs whose longer side is ``longest`` pixels in ``folder``."""
+    """Return ``folder`` or the smaller copy beside it, for photographs whose longer side is ``longest`` pixels in
+    ``folder``."""
     choices = {1: folder} if folder.is_dir() else {}
     for copy in folder.parent.glob(f"{folder.name}_*") if longest > LONGEST or not choices else ():
         match = re.fullmatch(r"_([1-9]\d{0,2})", copy.name[len(folder.name) :])

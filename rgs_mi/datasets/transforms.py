@@ -8,8 +8,10 @@ nerfstudio has it). Each may stand in the file or in a frame.
 
 import json
 import os
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +27,7 @@ _COEFFICIENT_LIMITS = (-1e4, 1e4)
 
 
 def read_json(file: Path) -> dict:
-    """The parsed file, of which only the shape of the outermost level is checked: an object with a list of frames, each an
+    """Parse the file, of which only the shape of the outermost level is checked: an object with a list of frames, each an
     object. Raises: UserError for anything else."""
     try:
         meta = json.loads(file.read_bytes().decode("utf-8-sig"))
@@ -50,8 +52,8 @@ def read_json(file: Path) -> dict:
     return meta
 
 
-def frame_of(file: Path, meta: dict, index: int, smaller=None) -> Frame:
-    """Frame ``index`` of the parsed ``file``; ``smaller`` maps an image's path to that of a smaller copy.
+def frame_of(file: Path, meta: dict, index: int, smaller: Callable[[Path], Path] | None = None) -> Frame:
+    """Return frame ``index`` of the parsed ``file``; ``smaller`` maps an image's path to that of a smaller copy.
 
     Raises: UserError for bad entries; those of the focal length and the like follow with `Frame.camera`.
     """
@@ -72,20 +74,22 @@ def frame_of(file: Path, meta: dict, index: int, smaller=None) -> Frame:
 
 
 def image_stem(path: Path) -> Path:
-    """``path`` without an image's extension; other dots belong to the name."""
+    """Return ``path`` without an image's extension; other dots belong to the name."""
     return path.with_suffix("") if path.suffix.lower() in EXTENSIONS else path
 
 
 def find_image(path: Path) -> Path | None:
-    """The image file ``path``, which may lack its extension; None where there is none."""
+    """Return the image file ``path``, which may lack its extension; None where there is none."""
     named = path.suffix.lower() in EXTENSIONS
     choices = [path] if named else [path.with_name(path.name + extension) for extension in EXTENSIONS]
     # os.path.isfile, unlike Path's, answers False to names that no file system takes.
     return next((choice for choice in choices if os.path.isfile(choice)), None)
 
 
-def number(meta: dict, frame: dict, key: str, default, limits, unit: str, where: str):
-    """The number ``key`` of the frame, else of the file, else ``default``. Raises: UserError outside of ``limits``."""
+def number(
+    meta: dict, frame: dict, key: str, default: float | None, limits: tuple[float, float], unit: str, where: str
+) -> Any:
+    """Return the number ``key`` of the frame, else of the file, else ``default``. Raises: UserError outside of ``limits``."""
     value = frame.get(key, meta.get(key))
     if value is None:
         return default
@@ -100,8 +104,8 @@ def number(meta: dict, frame: dict, key: str, default, limits, unit: str, where:
     return found
 
 
-def matrix(value, where: str, remedy: str) -> np.ndarray:
-    """Rows of numbers as an array. Raises: UserError for anything else."""
+def matrix(value: Any, where: str, remedy: str) -> np.ndarray:
+    """Return rows of numbers as an array. Raises: UserError for anything else."""
     try:
         return np.array([[_float(x) for x in row] for row in value], np.float64)
     except (TypeError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""What a capture is: photographs with their cameras, and what is known of their depths."""
+"""The types of a capture: photographs with their cameras, and what is known of their depths."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,15 +31,16 @@ class View:
 
     @property
     def alpha(self) -> np.ndarray:
-        """[H, W] float32 coverage in [0, 1]."""
+        """The coverage in [0, 1], [H, W] float32."""
         alpha = self.pixels[..., 3]
         return alpha / np.float32(255) if alpha.dtype == np.uint8 else alpha
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """A capture. ``train`` is fitted, ``test`` is held out (and only ever looked at); ``points`` are [N, 3] positions
-    and ``point_colors`` [N, 3] linear colours of a sparse reconstruction where the layout has one."""
+    """A capture in the folder ``root``. ``train`` is fitted, ``test`` is held out (and only ever looked at); ``points`` are
+    world-space positions [N, 3] and ``point_colors`` linear colours [N, 3] of a sparse reconstruction where the layout has
+    one."""
 
     train: list[View]
     test: list[View]
@@ -50,11 +51,11 @@ class Dataset:
 
 @dataclass(frozen=True)
 class DepthPrior:
-    """What a prior knows of one view's depth, up to a scale and a shift of its own.
+    """The depth of one view as a prior knows it, up to a scale and a shift of its own.
 
     Attributes
       values:     [H, W] float32 at the photograph's size, NaN where unknown: z-depth along the viewing axis, or its inverse.
-                  Their unit is the prior's: only the shape of the map counts (`losses.pearson_depth`)
+                  Their unit is the prior's: only the shape of the map counts (docs/method.md §4)
       inverse:    whether they are inverse depths, larger where nearer
       confidence: [H, W] float32, larger where surer, 0 where unknown; in the prior's own unit. None: not told
     """

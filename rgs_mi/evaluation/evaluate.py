@@ -1,6 +1,7 @@
 """How good a fit is: held-out views rendered, compared with their photographs, and timed."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -8,12 +9,15 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import as_float
+from ..core.camera import Camera
 from ..core.color import display
+from ..datasets.types import View
 from ..fit import losses
 from ..shading import deferred
+from ..surfels.surfels import Surfels
 from . import lpips, metrics
 
-#: Figures of one view; the mean over views has the same names.
+#: Scores of one view; the mean over views has the same names.
 SCORES = ("psnr", "ssim", "lpips", "lpips_alex", "normal_mae_deg", "normal_ssim", "normal_lpips")
 
 
@@ -21,7 +25,7 @@ SCORES = ("psnr", "ssim", "lpips", "lpips_alex", "normal_mae_deg", "normal_ssim"
 class Rendering:
     """A rendered view as NumPy arrays, float32.
 
-    image:  [H, W, 3] display values in [0, 1] over the background, what is compared with the photograph
+    image:  [H, W, 3] display values in [0, 1] over the background, which are compared with the photograph
     alpha:  [H, W, 1] coverage
     maps:   name -> [H, W, channels], premultiplied by coverage: color, diffuse, specular (linear radiance), sh_normal
             (world space, unit length before), base_color, roughness, metallic, depth
@@ -32,8 +36,10 @@ class Rendering:
     maps: dict[str, np.ndarray]
 
 
-def render_view(surfels, lighting, camera, background, spp=1) -> Rendering:
-    """Render ``surfels`` under a `Lighting` (None: diffuse only) over the display-space grey level ``background``, with
+def render_view(
+    surfels: Surfels, lighting: deferred.Lighting | None, camera: Camera, background: float, spp: int = 1
+) -> Rendering:
+    """Render ``surfels`` under ``lighting`` (None: diffuse only) over the display-space grey level ``background``, with
     ``spp`` samples per pixel, rounded up to a square: linear radiance and all maps are means over a grid, as those of
     'rgs_deferred'."""
     (width, height), (fine, side) = camera.size, camera.subdivided(spp)
@@ -64,47 +70,47 @@ def render_view(surfels, lighting, camera, background, spp=1) -> Rendering:
     return Rendering(np.clip(shown, 0, 1), alpha, means)
 
 
-def ground_truth(view, background) -> np.ndarray:
-    """[H, W, 3] the photograph of ``view`` as `Rendering.image` has it."""
+def ground_truth(view: View, background: float) -> np.ndarray:
+    """Return the photograph of ``view`` as `Rendering.image` has it, [H, W, 3]."""
     return display(view.pixels, background)
 
 
-def score(view, rendering: Rendering, background) -> dict:
-    """The `SCORES` of one view. ``lpips`` and ``normal_lpips`` are with VGG16, as in the papers that build on 3DGS.
+def score(view: View, rendering: Rendering, background: float) -> dict[str, float | None]:
+    """Return the `SCORES` of one view. ``lpips`` and ``normal_lpips`` are with VGG16, as in the papers that build on 3DGS.
 
-    None: figures of normals where the view has none, and of LPIPS where its weights are not installed or the view is too
-    small for it. Normals are compared as pictures (`metrics.normal_colors`) that are white where the view's are unknown.
+    Scores of normals are None where the view has none, and those of LPIPS where its weights are not installed or the view is
+    too small for it. Normals are compared as images (`metrics.normal_colors`) that are white where the view's are unknown.
     Raises: UserError where the weights are damaged.
     """
     distance = lpips.distance if lpips.installed() else lambda *_: float("nan")
     pair = rendering.image, ground_truth(view, background)
-    figures = dict.fromkeys(SCORES) | {
+    scores = dict.fromkeys(SCORES) | {
         "psnr": metrics.psnr(*pair),
         "ssim": metrics.ssim(*pair),
         "lpips": _finite(distance(*pair, "vgg")),
         "lpips_alex": _finite(distance(*pair, "alex")),
     }
     if view.normal is not None:
-        pair = _normal_pictures(view, rendering)
-        figures |= {
+        pair = _normal_images(view.normal, view.alpha, rendering)
+        scores |= {
             "normal_mae_deg": _finite(metrics.normal_mae_deg(rendering.maps["sh_normal"], view.normal, view.alpha)),
             "normal_ssim": metrics.ssim(*pair),
             "normal_lpips": _finite(distance(*pair, "vgg")),
         }
-    return figures
+    return scores
 
 
-def _normal_pictures(view, rendering):
-    """The normals of the rendering and the view's, [H, W, 3] each."""
-    unknown = (np.linalg.norm(view.normal, axis=-1) < 0.5) & (view.alpha > 0)
-    alphas = np.where(unknown, 0, [rendering.alpha[..., 0], view.alpha])
-    normals = np.where(unknown[..., None], 0, [rendering.maps["sh_normal"], view.normal * view.alpha[..., None]])
-    return tuple(map(metrics.normal_colors, normals, alphas))
+def _normal_images(normal, alpha, rendering):
+    """The normals of the rendering and a view's, [H, W, 3] each."""
+    unknown = (np.linalg.norm(normal, axis=-1) < 0.5) & (alpha > 0)
+    alphas = np.where(unknown, 0, [rendering.alpha[..., 0], alpha])
+    normals = np.where(unknown[..., None], 0, [rendering.maps["sh_normal"], normal * alpha[..., None]])
+    return metrics.normal_colors(normals[0], alphas[0]), metrics.normal_colors(normals[1], alphas[1])
 
 
-def mean_scores(scores: list[dict]) -> dict:
-    """The mean of each figure over the views that have it, None where none has."""
-    known = {name: [s[name] for s in scores if s[name] is not None] for name in SCORES}
+def mean_scores(scores: list[dict[str, float | None]]) -> dict[str, float | None]:
+    """Return the mean of each score over the views that have it, None where none has."""
+    known = {name: [value for s in scores if (value := s[name]) is not None] for name in SCORES}
     return {name: float(np.mean(values)) if values else None for name, values in known.items()}
 
 
@@ -112,9 +118,11 @@ def _finite(value):
     return value if np.isfinite(value) else None
 
 
-def frames_per_second(surfels, lighting, cameras, spp=1, frames=20) -> float:
-    """Views per second with ``spp`` samples per pixel, G-buffer and shading, kernels compiled and the environment filtered
-    beforehand: the median."""
+def frames_per_second(
+    surfels: Surfels, lighting: deferred.Lighting | None, cameras: Sequence[Camera], spp: int = 1, frames: int = 20
+) -> float:
+    """Return the median of frames per second over ``frames`` renderings of ``cameras`` in turn, with ``spp`` samples per
+    pixel: G-buffer and shading, kernels compiled and the environment filtered beforehand."""
     seconds, cameras = [], [camera.subdivided(spp)[0] for camera in cameras]
     with dr.suspend_grad():
         for k in range(frames + 1):

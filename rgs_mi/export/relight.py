@@ -1,5 +1,6 @@
 """A loaded scene of surfels under another light, or of another material."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import drjit as dr
@@ -11,13 +12,13 @@ from ..core.errors import UserError
 from ..plugins import surfels_of
 from ..targets import environments
 
-#: What of the surfels can be set: name -> numbers each has.
+#: Materials of surfels that can be set: name -> channels.
 MATERIAL = {"roughness": 1, "metallic": 1, "base_color": 3}
 
 
-def relight(scene, path, envmap=None, rotate=0.0):
+def relight(scene: "mi.Scene", path: str | Path, envmap: str | Path | None = None, rotate: float = 0.0) -> None:
     """Put another ``envmap`` (an image, latitude-longitude, or the name of an environment of the suite; None: as it is) into
-    the ``scene`` that ``path`` was loaded from, in the place and orientation of its own, turned by ``rotate`` degrees about
+    the ``scene`` that was loaded from ``path``, in the place and orientation of its own, turned by ``rotate`` degrees about
     its up axis.
 
     Raises: UserError for a scene without an environment map, and an image that can't be read.
@@ -52,8 +53,9 @@ def _load(envmap):
     return mi.load_dict({"type": "envmap", "bitmap": bitmap})
 
 
-def edit(scene, path, changes):
-    """Set materials of all surfels: ``changes`` are strings 'roughness=0.1', 'base_color=0.8,0.1,0.1', of `MATERIAL`.
+def edit(scene: "mi.Scene", path: str | Path, changes: Sequence[str]) -> None:
+    """Set materials of all surfels of the ``scene`` that was loaded from ``path``: ``changes`` are strings 'roughness=0.1',
+    'base_color=0.8,0.1,0.1', of `MATERIAL`.
 
     Raises: UserError for another name, and numbers that are no material.
     """
@@ -69,5 +71,5 @@ def edit(scene, path, changes):
         if len(values) not in (1, MATERIAL[name]) or not all(0 <= v <= 1 for v in values):
             raise UserError(f"--set {change}: needs {MATERIAL[name]} number(s) from 0 to 1")
         count = dr.width(params[name].array) // MATERIAL[name]
-        params[name] = as_tensor(np.broadcast_to(np.float32(values), (count, MATERIAL[name])))
+        params[name] = as_tensor(np.broadcast_to(np.array(values, np.float32), (count, MATERIAL[name])))
     params.update()

@@ -1,7 +1,8 @@
-"""Pictures and videos of a fitted scene from its own views, along them or from a turntable, through ``mi.load_file`` and
+"""Images and videos of a fitted scene from its own views, along them or from a turntable, through ``mi.load_file`` and
 ``mi.render``."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import mitsuba as mi
@@ -27,28 +28,28 @@ AOVS = ("albedo", "roughness", "metallic", "sh_normal", "depth", "diffuse", "spe
 
 
 def render_scene(
-    path,
+    path: str | Path,
     *,
-    variables=None,
-    view=None,
-    turntable=None,
-    along=None,
-    filmed=False,
-    size=None,
-    spp=None,
-    out=None,
-    aovs=False,
-    envmap=None,
-    rotate=0.0,
-    changes=(),
-    quiet=False,
+    variables: dict[str, str] | None = None,
+    view: str | None = None,
+    turntable: int | None = None,
+    along: int | None = None,
+    filmed: bool = False,
+    size: int | None = None,
+    spp: int | None = None,
+    out: str | Path | None = None,
+    aovs: bool = False,
+    envmap: str | Path | None = None,
+    rotate: float = 0.0,
+    changes: Sequence[str] = (),
+    quiet: bool = False,
 ) -> list[Path]:
     """Render a scene of surfels into PNGs with straight alpha, and return their paths.
 
     Args:
       path:      a run's folder, or a scene file
       variables: of the scene, to override its defaults
-      view:      a sensor, by its id or number (default: the first)
+      view:      a sensor, by its id or index (default: the first)
       turntable: instead of a view, that many frames of a camera that circles the object about the environment's
                  up axis, at the sensors' mean distance and elevation
       along:     instead of a view, that many frames of a camera that moves from sensor to sensor in their order, which for
@@ -58,7 +59,7 @@ def render_scene(
       spp:       samples per pixel; a square number for 'rgs_deferred' (default: what the first sensor says)
       out:       a folder, or a PNG for a single view (default: ``renders``, ``turntable`` or ``path`` beside the scene)
       aovs:      whether to write ``NAME.exr`` as well: radiance, alpha and the G-buffer, float32
-      envmap, rotate: another light, and the degrees by which light is turned (`relight`)
+      envmap, rotate: another environment map, and the degrees by which light is turned (`relight`)
       changes:   materials to set (`relight.edit`)
 
     Raises: UserError for bad input and where a file can't be written.
@@ -115,17 +116,17 @@ def _render(scene, sensor, integrator, spp, progress):
     for k, samples in enumerate(passes):
         image += samples / spp * np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=samples, seed=k))
         progress((k + 1) / len(passes))
-    return image
+    return np.asarray(image)
 
 
 def straight(image: np.ndarray) -> np.ndarray:
-    """[H, W, 4] display values with straight alpha from a rendering, linear and premultiplied [H, W, 4 or more]."""
+    """Take a rendering, linear and premultiplied [H, W, 4 or more], to display values with straight alpha [H, W, 4]."""
     alpha = np.clip(image[..., 3:4], 0, 1)
     return np.concatenate([srgb_encode(np.clip(image[..., :3] / np.maximum(alpha, 1e-6), 0, 1)), alpha], -1)
 
 
-def sensor_dict(camera) -> dict:
-    """A sensor for `mi.load_dict`, with alpha."""
+def sensor_dict(camera: Camera) -> dict:
+    """Return a sensor for ``mi.load_dict`` whose film has alpha."""
     sensor = camera.to_sensor_dict()
     sensor["film"]["pixel_format"] = "rgba"
     return sensor
@@ -134,11 +135,11 @@ def sensor_dict(camera) -> dict:
 def _view(scene, path, view):
     """{name: camera} of one sensor."""
     ids = [sensor.id() for sensor in scene.sensors()]
-    number = 0 if view is None else ids.index(view) if view in ids else int(view) if view.isdigit() else -1
-    if not 0 <= number < len(ids):
+    index = 0 if view is None else ids.index(view) if view in ids else int(view) if view.isdigit() else -1
+    if not 0 <= index < len(ids):
         shown = ", ".join(ids[:5]) + (", …" if len(ids) > 5 else "")
         raise UserError(f"{path}: has no view '{view}': give a name ({shown}) or a number below {len(ids)}")
-    return {ids[number]: Camera.from_sensor(scene.sensors()[number])}
+    return {ids[index]: Camera.from_sensor(scene.sensors()[index])}
 
 
 def _circle(scene, path, frames):
@@ -177,15 +178,16 @@ def _along(scene, path, frames):
     knots, times = np.arange(len(cameras)), np.linspace(0, len(cameras) - 1, frames)
     through = lambda values: PchipInterpolator(knots, values)(times)
     rotations = RotationSpline(knots, Rotation.from_matrix([c.to_world[:3, :3] for c in cameras]))(times).as_matrix()
-    seen = through([c.rotation @ (center - c.origin) for c in cameras])  # the centre in camera space
+    seen = through([c.rotation @ (center - c.origin) for c in cameras])  # the center in camera space
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = rotations, center - np.einsum("kij,kj->ki", rotations, seen)
     focal, principal = (through([getattr(c, name) for c in cameras]) for name in ("focal", "principal"))
     return {f"{k:03}": Camera(poses[k], tuple(focal[k]), tuple(principal[k]), size) for k in range(frames)}
 
 
-def with_aovs(scene, path):
-    """The scene's integrator with all its AOVs. Raises: UserError for one of another type."""
+def with_aovs(scene: "mi.Scene", path: str | Path) -> "mi.Integrator":
+    """Return the integrator of the ``scene`` in the file ``path`` with all its AOVs. Raises: UserError for one of another
+    type."""
     own = scene.integrator()
     if not is_deferred(own):
         raise UserError(f"{path}: maps come from the integrator 'rgs_deferred' only: leave out --aovs")

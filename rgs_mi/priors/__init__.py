@@ -10,13 +10,14 @@ none
 import hashlib
 import inspect
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ..core.caches import cached_arrays
 from ..core.errors import UserError
-from ..datasets.types import DepthPrior
+from ..datasets.types import DepthPrior, View
 from . import files, hull, stereo, vggt
 
 __all__ = ["NAMES", "DepthPrior", "depth_priors"]
@@ -24,13 +25,13 @@ __all__ = ["NAMES", "DepthPrior", "depth_priors"]
 _VERSION = 2  # of everything that decides what is in the maps: a cached prior of another version is not read
 
 
-def _hull(views, resolution: int | None = None) -> list[DepthPrior]:
+def _hull(views: Sequence[View], resolution: int | None = None) -> list[DepthPrior]:
     """z-depths of the visual hull, ``resolution`` steps along its longest side (None: as many as `hull.visual_hull` takes);
     NaN beside it. Needs a JIT variant."""
     return _depths(hull.visual_hull(views, resolution), views)
 
 
-def _stereo(views, resolution: int | None = None) -> list[DepthPrior]:
+def _stereo(views: Sequence[View], resolution: int | None = None) -> list[DepthPrior]:
     """As `_hull`, of `stereo.carved_hull`."""
     return _depths(stereo.carved_hull(views, resolution), views)
 
@@ -40,16 +41,22 @@ def _depths(field, views):
     return [DepthPrior(depth) for depth in hull.depth_maps(vertices, faces, [view.camera for view in views])]
 
 
-_PRIORS = {"hull": _hull, "stereo": _stereo, "files": files.load, "vggt": vggt.estimate}
+_PRIORS: dict[str, Callable[..., list[DepthPrior]]] = {
+    "hull": _hull,
+    "stereo": _stereo,
+    "files": files.load,
+    "vggt": vggt.estimate,
+}
 NAMES = (*_PRIORS, "none")
 
 
-def depth_priors(name: str, views, *, cache=None, **options) -> list[DepthPrior] | None:
-    """The prior called ``name`` of each of ``views``, in their order; None for ``none``.
+def depth_priors(
+    name: str, views: Sequence[View], *, cache: str | Path | None = None, **options: object
+) -> list[DepthPrior] | None:
+    """Return the prior called ``name`` of each of ``views``, in their order; None for ``none`` (docs/method.md §5).
 
     Args:
       name: one of `NAMES`
-      views: list of `View`
       cache: folder where results are kept, or None. A result is found again by the photographs' pixels, the options, the
         hull's cameras and VGGT's weights, wherever the files lie. What `files` reads is not kept a second time
       options: hull, stereo: resolution; files: folder, inverse, suffix (`files.load`); vggt: weights, batch, overlap,

@@ -1,26 +1,27 @@
-"""Depth maps from files: what any estimator wrote, one map a photograph, matched by name.
+"""Depth maps from files: what any estimator wrote, one map per photograph, matched by name.
 
 ``.npz`` (a single array, or the one named ``depth``), ``.npy``, ``.exr`` and 16-bit grey ``.png`` (0 where unknown). NaN and
 infinity are unknown in all of them.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from ..core.errors import UserError
 from ..datasets.images import MAX_PIXELS, check_size, resize
-from ..datasets.types import DepthPrior
-from .maps import outlined
+from ..datasets.types import DepthPrior, View
+from .maps import masked
 
 _ASPECT = 0.05  # how far proportions may be off: estimators round sizes to multiples of 14 or 32
 
 
-def load(views, folder, inverse: bool = False, suffix: str = "") -> list[DepthPrior]:
-    """The maps in ``folder`` that belong to ``views``.
+def load(views: Sequence[View], folder: str | Path, inverse: bool = False, suffix: str = "") -> list[DepthPrior]:
+    """Read the maps in ``folder`` that belong to ``views``, in their order.
 
     Args:
-      views: list of `View`; the map of a view is the file called its name and ``suffix``, whatever the extension
+      views: the map of a view is the file called its name and ``suffix``, whatever the extension
       inverse: whether the files hold inverse depths (disparities)
 
     Maps of another size are resized (`maps.resize`), since estimators have sizes of their own; other proportions are an
@@ -47,7 +48,7 @@ def load(views, folder, inverse: bool = False, suffix: str = "") -> list[DepthPr
                 f"{paths[0]} is {values.shape[1]} x {values.shape[0]}, its photograph {width} x {height}: "
                 "a depth map must show the whole photograph and no more"
             )
-        priors.append(DepthPrior(outlined(resize(values, height, width), view), inverse))
+        priors.append(DepthPrior(masked(resize(values, height, width), view), inverse))
     return priors
 
 

@@ -6,14 +6,16 @@ bilinearly, so the surface lies between grid nodes and is not stair-stepped. Nee
 mislead it; concavities that no silhouette shows stay filled.
 """
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage, spatial, special
 
-from ..core.camera import focus_point, opaque, pixel_rays
+from ..core.camera import Camera, focus_point, opaque, pixel_rays
 from ..core.errors import UserError
+from ..datasets.types import View
 
 _EDGE_SIGMA = 0.6  # pixels; small enough that lines one pixel wide stay above one half
 _PIXEL_VARIANCE = 1 / 12  # of the box that an antialiased mask has been averaged over
@@ -43,14 +45,14 @@ class SignedField:
 
 @dataclass(frozen=True)
 class _Silhouette:
-    """One view's mask as a signed distance in pixels ([H, W] float32, positive inside), and its camera.
+    """One view's mask as a signed ``distance`` in pixels ([H, W] float32, positive inside), and its ``camera``.
 
     ``limits``: (left, top, right, bottom) in pixels; beyond them the view does not decide, since there the mask touches
     the frame's border. A side that it does not touch is infinite: the object ends before it.
     """
 
     distance: np.ndarray
-    camera: object
+    camera: Camera
     limits: tuple[float, float, float, float]
 
     @classmethod
@@ -61,10 +63,11 @@ class _Silhouette:
         left, top, right, bottom = (0 if o else _PAD for o in open_)
         alpha = np.pad(alpha, ((top, bottom), (left, right)))
         height, width = alpha.shape
-        limits = [
+        within = [
             limit if o else sign * np.inf for o, limit, sign in zip(open_, (0, 0, width - 1, height - 1), (-1, -1, 1, 1))
         ]
-        return cls(_signed_distance(alpha), camera.cropped(-left, -top, width, height), tuple(limits))
+        limits = within[0], within[1], within[2], within[3]
+        return cls(_signed_distance(alpha), camera.cropped(-left, -top, width, height), limits)
 
     def sample(self, points: np.ndarray) -> np.ndarray:
         """World-space signed distance [N] from the silhouette's cone at ``points`` [N, 3]; NaN where undecided."""
@@ -98,8 +101,8 @@ def _signed_distance(alpha: np.ndarray) -> np.ndarray:
     """
     blurred = ndimage.gaussian_filter(alpha, _EDGE_SIGMA, truncate=4)
     inside = blurred > 0.5
-    rim = inside & ~ndimage.binary_erosion(inside, border_value=1)
-    distance = ndimage.distance_transform_edt(~rim).astype(np.float32)
+    rim = inside & ~np.asarray(ndimage.binary_erosion(inside, border_value=1), bool)
+    distance = np.asarray(ndimage.distance_transform_edt(~rim)).astype(np.float32)
     distance = np.where(inside, distance + np.float32(0.5), np.float32(0.5) - distance)
     near = np.abs(distance) < 1.2
     offset = special.erfinv(np.clip(2 * blurred[near] - 1, -0.98, 0.98))
@@ -165,8 +168,9 @@ def _shape(lower, upper, step) -> tuple[int, ...]:
     return tuple(int(np.ceil(d / step)) + 1 for d in upper - lower)
 
 
-def object_box(views) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner [3] of the masked object, from cameras and masks alone, with a small margin.
+def object_box(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lower and upper corner [3] of the masked object, in world space, from cameras and masks alone, with a small
+    margin.
 
     Starts from the cube around the point that the cameras look at which reaches as far as the cameras do, carves it
     coarsely and shrinks it to what is left, until that changes little. Raises: UserError without masks, or when the
@@ -195,8 +199,8 @@ def _object_box(silhouettes):
     return lower, upper
 
 
-def carve(views, box, resolution: int = 160) -> SignedField:
-    """The visual hull of all masked views on a grid with ``resolution`` steps along the longest side of ``box``.
+def carve(views: Sequence[View], box: tuple[np.ndarray, np.ndarray], resolution: int = 160) -> SignedField:
+    """Return the visual hull of all masked views on a grid with ``resolution`` steps along the longest side of ``box``.
 
     ``box`` is (lower [3], upper [3]) as from `object_box`. A view whose mask ends inside its frame carves all that is
     beside it; beyond a border that the mask touches the view does not decide. Raises: UserError without masks, or when
@@ -205,14 +209,14 @@ def carve(views, box, resolution: int = 160) -> SignedField:
     return _field(_silhouettes(views), box, resolution)
 
 
-def visual_hull(views, resolution: int | None = None) -> SignedField:
-    """`carve` inside `object_box`, measuring the silhouettes once. Unless ``resolution`` is given, a step is as long as the
-    typical photograph's pixel is there, but for a least and a greatest number of steps."""
+def visual_hull(views: Sequence[View], resolution: int | None = None) -> SignedField:
+    """Return `carve` inside `object_box`, measuring the silhouettes once. Unless ``resolution`` is given, a step is as long
+    as the typical photograph's pixel is there, but for a least and a greatest number of steps."""
     return visual_hulls(views, resolution)[0]
 
 
-def visual_hulls(views, *resolutions: int | None) -> list[SignedField]:
-    """`visual_hull` at each of ``resolutions``, measuring silhouettes and box once for all."""
+def visual_hulls(views: Sequence[View], *resolutions: int | None) -> list[SignedField]:
+    """Return the `visual_hull` at each of ``resolutions``, measuring silhouettes and box once for all."""
     silhouettes = _silhouettes(views)
     box = _object_box(silhouettes)
     return [_field(silhouettes, box, resolution or _pixels_across(silhouettes, *box)) for resolution in resolutions]
@@ -249,8 +253,8 @@ def _field(silhouettes, box, resolution):
 
 
 def surface(field: SignedField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The zero level: vertices [V, 3] (world), faces [F, 3] int32 (counter-clockwise from outside), outward unit
-    normals [V, 3]."""
+    """Return the zero level of ``field`` by marching cubes: vertices [V, 3] (world), faces [F, 3] int32 (counter-clockwise
+    from outside), outward unit normals [V, 3]."""
     from skimage.measure import marching_cubes
 
     nodes, faces, _, _ = marching_cubes(field.values, 0.0, gradient_direction="ascent")
@@ -263,9 +267,11 @@ def surface(field: SignedField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return vertices, faces.astype(np.int32), normals.astype(np.float32)
 
 
-def sample_surface(vertices, faces, normals, count: int, rng) -> tuple[np.ndarray, np.ndarray]:
-    """``count`` points on a mesh: positions [count, 3] and unit normals [count, 3], float32. They are spread evenly, but
-    up to four times as densely where the mesh bends.
+def sample_surface(
+    vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return ``count`` points on a mesh as of `surface`: positions [count, 3] and unit normals [count, 3], float32. They are
+    spread evenly, but up to four times as densely where the mesh bends.
 
     Six times as many weighted samples are thinned to a Poisson-disk set, in rounds: a sample stays when no
     remaining neighbour comes before it in a random order. Too many are cut and too few topped up at random.
@@ -280,7 +286,7 @@ def sample_surface(vertices, faces, normals, count: int, rng) -> tuple[np.ndarra
     positions = (weights * corners[face]).sum(1)
 
     radius = 0.69 * np.sqrt((area * density).sum() / (count * density[face]))
-    a, b = spatial.cKDTree(positions).query_pairs(radius.max(), output_type="ndarray").T  # a < b: the index is the order
+    a, b = spatial.KDTree(positions).query_pairs(radius.max(), output_type="ndarray").T  # a < b: the index is the order
     close = np.linalg.norm(positions[a] - positions[b], axis=1) < np.minimum(radius[a], radius[b])
     a, b = a[close], b[close]
     state = np.zeros(6 * count, np.int8)  # 0 open, 1 kept, -1 removed
@@ -307,8 +313,9 @@ def _bend(faces, normals, area):
     return (total / np.maximum(np.bincount(faces.ravel(), np.repeat(area, 3)), 1e-12))[faces].mean(1)
 
 
-def depth_maps(vertices, faces, cameras) -> list[np.ndarray]:
-    """The mesh seen by each camera: a list of [H, W] float32 z-depths, NaN where it is missed. Needs a JIT variant."""
+def depth_maps(vertices: np.ndarray, faces: np.ndarray, cameras: Sequence[Camera]) -> list[np.ndarray]:
+    """Return the mesh of ``vertices`` [V, 3] and ``faces`` [F, 3] as each camera sees it: [H, W] float32 z-depths in world
+    units, NaN where it is missed. A JIT variant must be active."""
     import drjit as dr
     import mitsuba as mi
 

@@ -12,10 +12,14 @@ _FAR = 10
 _SRGB_TO_LINEAR = srgb_decode(np.arange(256) / 255).astype(np.float32)
 
 
+#: Positions [N, 3], unit normals [N, 3] or None, linear colours [N, 3], and distances to neighbours [N].
+Points = tuple[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray]
+
+
 def initial_points(
     dataset: Dataset, count: int, seed: int = 0, on_hull: bool = True, carve: bool = True, quiet: bool = True
-):
-    """Starting points of a fit to ``dataset.train``, world space, all float32.
+) -> Points:
+    """Return the starting points of a fit to ``dataset.train``, world space, all float32 (docs/method.md §5).
 
     The surface of the visual hull (of `stereo.carved_hull` with ``carve``) where photographs have masks and ``on_hull`` is
     set (``count`` points), else ``dataset.points`` (a random ``count`` of them where there are more), else ``count`` points
@@ -38,7 +42,7 @@ def initial_points(
             return positions, None, np.asarray(dataset.point_colors, np.float32)[chosen], _spacing(positions)
     else:
         center, reach = focus_point([view.camera for view in views])
-        # Half a frame's extent at the centre, for the typical camera: inside that ball all of them see something.
+        # Half a frame's extent at the center, for the typical camera: inside that ball all of them see something.
         half = np.median([min(v.camera.size[k] / v.camera.focal[k] for k in (0, 1)) / 2 for v in views])
         ball = rng.normal(size=(count, 3))
         ball *= rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1, keepdims=True)
@@ -46,9 +50,9 @@ def initial_points(
     return positions, None, _colors(positions, views), _spacing(positions)
 
 
-def surroundings(dataset: Dataset, count: int, seed: int = 0):
-    """Points far away for what lies behind an object without a mask: on a sphere about it, `_FAR` times as far as the
-    cameras. Returns: as `initial_points`; the normals point inwards."""
+def surroundings(dataset: Dataset, count: int, seed: int = 0) -> Points:
+    """Return points far away for what lies behind an object without a mask, as `initial_points` does: on a sphere about it,
+    `_FAR` times as far as the cameras; the normals point inwards."""
     center, reach = focus_point([view.camera for view in dataset.train])
     outward = np.random.default_rng((seed, 1)).normal(size=(count, 3))
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
@@ -61,7 +65,7 @@ def _spacing(positions: np.ndarray) -> np.ndarray:
     neighbours = min(3, len(positions) - 1)
     if neighbours < 1:
         return np.ones(len(positions), np.float32)
-    distance, _ = spatial.cKDTree(positions).query(positions, neighbours + 1, workers=-1)
+    distance, _ = spatial.KDTree(positions).query(positions, neighbours + 1, workers=-1)
     return np.maximum(distance[:, 1:].mean(1), 1e-7).astype(np.float32)
 
 

@@ -7,6 +7,7 @@ of a batch; the time that a batch takes grows with its square.
 import hashlib
 import re
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,8 @@ import numpy as np
 from ..core.color import display
 from ..core.errors import UserError
 from ..datasets.images import resize
-from ..datasets.types import DepthPrior
-from .maps import outlined
+from ..datasets.types import DepthPrior, View
+from .maps import masked
 
 HUB = "facebook/VGGT-1B"
 _SIDE, _PATCH = 518, 14  # of the longer side after VGGT's preprocessing, and of a token, in pixels
@@ -27,11 +28,13 @@ _INSTALL = (
 )
 
 
-def estimate(views, weights: str = HUB, batch: int = 24, overlap: int = 6, background: float = 1.0) -> list[DepthPrior]:
-    """VGGT's z-depths of all ``views`` and its confidences, which begin at 1; all in one unit.
+def estimate(
+    views: Sequence[View], weights: str = HUB, batch: int = 24, overlap: int = 6, background: float = 1.0
+) -> list[DepthPrior]:
+    """Return VGGT's z-depths of all ``views`` and its confidences, which begin at 1; all in one unit.
 
     Args:
-      views: list of `View`; they are seen as in display, over the grey level ``background`` where they have masks
+      views: they are seen as in display, over the grey level ``background`` where they have masks
       weights: name of a Hugging Face model, or a local ``.pt`` or ``.safetensors`` file, or a folder with one
       batch: most views that the network sees together; overlap: fewest that two batches in a row share
 
@@ -43,7 +46,7 @@ def estimate(views, weights: str = HUB, batch: int = 24, overlap: int = 6, backg
     if not 1 <= overlap < batch:
         raise UserError(f"vggt: batch is {batch} and overlap {overlap}: overlap must be at least 1 and less than batch")
     network = _Network(weights)
-    priors = [None] * len(views)
+    priors: dict[int, DepthPrior] = {}
     with tempfile.TemporaryDirectory() as folder:
         files = [_write(Path(folder) / f"{i:06}.png", view, background) for i, view in enumerate(views)]
         for chosen in batches(len(views), batch, overlap):
@@ -51,26 +54,26 @@ def estimate(views, weights: str = HUB, batch: int = 24, overlap: int = 6, backg
             shapes = {views[i].pixels.shape[:2] for i in chosen}
             mode = "crop" if len(shapes) == 1 and all(h <= w for h, w in shapes) else "pad"
             found = [_prior(views[i], *maps) for i, maps in zip(chosen, network([files[i] for i in chosen], mode))]
-            scale = _scale([(priors[i], new) for i, new in zip(chosen, found) if priors[i] is not None])
+            scale = _scale([(priors[i], new) for i, new in zip(chosen, found) if i in priors])
             for i, new in zip(chosen, found):
-                priors[i] = priors[i] or DepthPrior(new.values * scale, False, new.confidence)
-    return priors
+                priors.setdefault(i, DepthPrior(new.values * scale, False, new.confidence))
+    return [priors[i] for i in range(len(views))]
 
 
 def batches(count: int, batch: int, overlap: int) -> list[range]:
-    """The fewest, equally long ranges of at most ``batch`` that cover ``count`` views and share ``overlap`` or more with the
-    next."""
+    """Return the fewest, equally long ranges of at most ``batch`` that cover ``count`` views and share ``overlap`` or more
+    with the next."""
     if count <= batch:
         return [range(count)]
-    number = -(-(count - overlap) // (batch - overlap))
-    size = -(-(count + (number - 1) * overlap) // number)
-    starts = [k * (count - size) // (number - 1) for k in range(number)]
+    n = -(-(count - overlap) // (batch - overlap))
+    size = -(-(count + (n - 1) * overlap) // n)
+    starts = [k * (count - size) // (n - 1) for k in range(n)]
     return [range(start, start + size) for start in starts]
 
 
 def fingerprint(weights: str) -> str:
-    """What distinguishes weights from others: a hub's name, or a hash of a file's size and of 1024 samples spread over it
-    (to read five gigabytes would take longer than to use them). Raises: UserError where no such file is."""
+    """Return what distinguishes weights from others: a hub's name, or a hash of a file's size and of 1024 samples spread over
+    it (to read five gigabytes would take longer than to use them). Raises: UserError where no such file is."""
     path = _local(weights)
     if path is None:
         return f"hub:{weights}"
@@ -102,7 +105,7 @@ def _prior(view, depth, confidence) -> DepthPrior:
     inner = [_SIDE if n == long else round(n * (_SIDE / long) / _PATCH) * _PATCH for n in (height, width)]
     top, left = (h - inner[0]) // 2, (w - inner[1]) // 2
     back = lambda x: resize(x[top : top + inner[0], left : left + inner[1]], height, width)
-    values = outlined(back(depth), view)
+    values = masked(back(depth), view)
     return DepthPrior(values, False, np.where(np.isfinite(values), back(confidence), np.float32(0)))
 
 
@@ -131,9 +134,9 @@ class _Network:
     def __init__(self, weights):
         path = _local(weights)
         try:
-            import torch
-            from vggt.models.vggt import VGGT
-            from vggt.utils.load_fn import load_and_preprocess_images
+            import torch  # pyright: ignore[reportMissingImports]  # optional
+            from vggt.models.vggt import VGGT  # pyright: ignore[reportMissingImports]  # optional
+            from vggt.utils.load_fn import load_and_preprocess_images  # pyright: ignore[reportMissingImports]  # optional
         except ImportError as error:
             raise UserError(f"the vggt prior needs packages that are not there ({error}): {_INSTALL}; {_OTHERS}") from error
         try:
@@ -192,9 +195,9 @@ def _local(weights) -> Path | None:
 def _state(path):
     """The weights in a file, by name."""
     if path.suffix == ".safetensors":
-        from safetensors.torch import load_file
+        from safetensors.torch import load_file  # pyright: ignore[reportMissingImports]  # optional
 
         return load_file(path)
-    import torch
+    import torch  # pyright: ignore[reportMissingImports]  # optional
 
     return torch.load(path, map_location="cpu", weights_only=True)

@@ -22,7 +22,7 @@ ENVIRONMENTS = {"cafe": cafe, "city": city, "kitchen": kitchen, "night": night, 
 
 
 def directions(height: int, width: int) -> np.ndarray:
-    """[height, width, 3] unit directions of the texels of an equirectangular map, in a z-up world.
+    """Return the unit directions [height, width, 3] of the texels of a latitude-longitude map, in a z-up world.
 
     Mitsuba's ``envmap`` is y-up; these are its directions after ``<rotate x="1" angle="90"/>``.
     """
@@ -33,7 +33,7 @@ def directions(height: int, width: int) -> np.ndarray:
 
 @functools.cache
 def environment(name: str, height: int = 512) -> np.ndarray:
-    """[height, 2 * height, 3] float32 linear radiance of an environment in the layout of Mitsuba's ``envmap``.
+    """Return the linear radiance [height, 2 · height, 3], float32, of an environment in the layout of Mitsuba's ``envmap``.
 
     Raises: UserError for an unknown name or a height below 2.
     """
@@ -48,7 +48,7 @@ def environment(name: str, height: int = 512) -> np.ndarray:
 
 
 def constant(radiance: float, height: int) -> np.ndarray:
-    """[height, 2 * height, 3] float32 map of one radiance. Raises: UserError for a height below 2."""
+    """Return a map of one radiance, [height, 2 · height, 3] float32. Raises: UserError for a height below 2."""
     if height < 2:
-        raise UserError(f"environment 'constant': rows is {height}, needs at least 2")
+        raise UserError(f"environment 'constant': height is {height}, needs at least 2")
     return np.full((height, 2 * height, 3), radiance, np.float32)

@@ -7,6 +7,7 @@ azimuth and elevation in radians; x is forward, z up.
 import functools
 
 import numpy as np
+import numpy.typing as npt
 
 from .meshes import Mesh, grid, join, lathe, mirrored, tube, unit
 
@@ -17,8 +18,8 @@ ROWS = {"crown": 110, "stripe": 10, "base": 110}  # and from the top to the edge
 # ---- The shell ----
 
 
-def direction(azimuth, elevation) -> np.ndarray:
-    """[..., 3] unit vectors."""
+def direction(azimuth: npt.ArrayLike, elevation: npt.ArrayLike) -> np.ndarray:
+    """Return the unit vectors [..., 3] of directions."""
     azimuth, elevation = np.broadcast_arrays(azimuth, elevation)
     c = np.cos(elevation)
     return np.stack([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)], -1)
@@ -30,7 +31,8 @@ def _bump(d, azimuth, elevation, width):
 
 
 def radius(d: np.ndarray) -> np.ndarray:
-    """[...] distance of the shell from the origin along unit directions d [..., 3]: an egg with a chin and a tail."""
+    """Return the distance [...] of the shell from the origin along unit directions ``d`` [..., 3]: an egg with a chin and a
+    tail."""
     axes = np.full(d.shape, 0.65)
     axes[..., 0] = np.where(d[..., 0] > 0, 0.76, 0.83)
     axes[..., 2] = np.where(d[..., 2] > 0, 0.74, 0.92)
@@ -38,8 +40,8 @@ def radius(d: np.ndarray) -> np.ndarray:
     return egg + 0.155 * _bump(d, 0, -0.55, 0.45) + 0.04 * _bump(d, np.pi, -0.15, 0.40)
 
 
-def surface(azimuth, elevation, offset=0.0) -> tuple[np.ndarray, np.ndarray]:
-    """Points [..., 3] at a height ``offset`` [...] over the shell, and the shell's unit normals [..., 3] below them."""
+def surface(azimuth: npt.ArrayLike, elevation: npt.ArrayLike, offset: npt.ArrayLike = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return points [..., 3] at a height ``offset`` [...] over the shell, and the shell's unit normals [..., 3] below them."""
     d = direction(azimuth, elevation)
     p = radius(d)[..., None] * d
     f = lambda q: np.linalg.norm(q, axis=-1) - radius(unit(q))
@@ -53,7 +55,7 @@ def _azimuths() -> np.ndarray:
 
 @functools.cache
 def edge() -> np.ndarray:
-    """[COLUMNS + 1] elevation of the lower edge, where the shell meets a gently curved plane; by bisection."""
+    """Return the elevation [COLUMNS + 1] of the lower edge, where the shell meets a gently curved plane; by bisection."""
     azimuth = _azimuths()
     height = -0.61 - 0.045 * np.cos(azimuth) + 0.03 * np.cos(2 * azimuth)
     low, high = np.full(azimuth.shape, -1.5), np.zeros(azimuth.shape)

@@ -1,13 +1,15 @@
 """Solids as signed fields f(p), negative inside: rounded combinations of simple solids, and their surface as a mesh.
 
 Points p are [N, 3], fields [N]. A field grows about as fast as distance does (its gradient is not much longer than 1).
+Lengths are in the model's units.
 """
 
 import itertools
 
 import numpy as np
+import numpy.typing as npt
 
-from .meshes import Mesh, unit
+from .meshes import Field, Mesh, unit
 
 BLOCK = 8  # grid points along a block that is skipped as a whole where the surface is far
 CHUNK = 1 << 17  # points that are evaluated together
@@ -18,51 +20,55 @@ EPSILON = 1e-4  # step of the differences that give a gradient
 # ---- Combining solids ----
 
 
-def union(a, b, radius):
-    """Both solids, the crease between them filled with a fillet of about ``radius``."""
+def union(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
+    """Return both solids, the crease between them filled with a fillet of about ``radius``."""
     h = np.maximum(1 - np.abs(a - b) / radius, 0)
     return np.minimum(a, b) - radius * h**3 / 6
 
 
-def intersection(a, b, radius):
-    """What both solids share, its edges rounded off."""
+def intersection(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
+    """Return what both solids share, its edges rounded off."""
     return -union(-a, -b, radius)
 
 
-def difference(a, b, radius):
-    """The first solid without the second, the edges rounded off."""
+def difference(a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
+    """Return the first solid without the second, the edges rounded off."""
     return -union(-a, b, radius)
 
 
 # ---- Solids ----
 
 
-def box(p, half, radius):
-    """A box of half extents ``half`` [3] with edges and corners of ``radius``."""
+def box(p: np.ndarray, half: npt.ArrayLike, radius: float) -> np.ndarray:
+    """Return a box of half extents ``half`` [3] with edges and corners of ``radius``."""
     q = np.abs(p) - (np.asarray(half) - radius)
     return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0) - radius
 
 
-def capsule(p, a, b, radius):
-    """All points within ``radius`` of the segment from a to b [3]."""
-    a, ab = np.asarray(a, float), np.subtract(b, a)
-    t = np.clip((p - a) @ ab / (ab @ ab), 0, 1)
-    return np.linalg.norm(p - a - t[:, None] * ab, axis=-1) - radius
+def capsule(p: np.ndarray, a: npt.ArrayLike, b: npt.ArrayLike, radius: float) -> np.ndarray:
+    """Return all points within ``radius`` of the segment from a to b [3]."""
+    start = np.asarray(a, float)
+    ab = np.asarray(b, float) - start
+    t = np.clip((p - start) @ ab / (ab @ ab), 0, 1)
+    return np.linalg.norm(p - start - t[:, None] * ab, axis=-1) - radius
 
 
-def ellipsoid(p, half):
-    """An ellipsoid of half axes ``half`` [3]; a distance to first order."""
+def ellipsoid(p: np.ndarray, half: npt.ArrayLike) -> np.ndarray:
+    """Return an ellipsoid of half axes ``half`` [3]; a distance to first order."""
+    half = np.asarray(half)
     q = p / half
     length = np.linalg.norm(q, axis=-1)
     return length * (length - 1) / np.maximum(np.linalg.norm(q / half, axis=-1), 1e-9)
 
 
-def swept(p, control, radii):
-    """A tube with round ends around a cubic Bezier curve: control [4, 3], radii [K] of a polynomial in t (0..1).
+def swept(p: np.ndarray, control: npt.ArrayLike, radii: npt.ArrayLike) -> np.ndarray:
+    """Return a tube with round ends around a cubic Bézier curve of control points ``control`` [4, 3]; ``radii`` [K] are the
+    coefficients of its radius, a polynomial in t from 0 to 1.
 
     The nearest point of the curve comes from samples, then Newton's method, so that the field is smooth. Points that
     are `FAR` from the control points' box have the distance from that box instead, which is less.
     """
+    radii = np.asarray(radii)
     control = np.asarray(control, float)
     gap = np.linalg.norm(np.maximum(np.maximum(control.min(0) - p, p - control.max(0)), 0), axis=-1)
     value, near = gap.copy(), gap < FAR
@@ -84,29 +90,29 @@ def swept(p, control, radii):
 # ---- Surface ----
 
 
-def gradient(f, p):
-    """[N, 3] derivative of a field, from the corners of a small tetrahedron."""
+def gradient(f: Field, p: np.ndarray) -> np.ndarray:
+    """Return the derivative [N, 3] of a field at ``p`` [N, 3], from the corners of a small tetrahedron."""
     corners = EPSILON * np.array([[1, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1.0]])
-    return sum(f(p + e)[:, None] * e for e in corners) / (4 * EPSILON**2)
+    return np.asarray(sum(f(p + e)[:, None] * e for e in corners)) / (4 * EPSILON**2)
 
 
-def surface(f, low, high, step: float) -> Mesh:
-    """The surface f = 0 within a box, closed where it does not leave the box, with f's own normals.
+def surface(f: Field, low: npt.ArrayLike, high: npt.ArrayLike, step: float) -> Mesh:
+    """Return the surface f = 0 within a box, closed where it does not leave the box, with f's own normals.
 
     Args:
-      f:    field, callable on [N, 3]; details and gaps thinner than two steps are lost
+      f:    field; details and gaps thinner than two steps are lost
       low, high: [3] corners of the box
       step: distance of the grid's points, about the length of an edge of the mesh
 
-    Surface nets: every cell of a grid that the surface crosses gives one vertex, every edge that it crosses a
+    Surface nets (Gibson 1998): every cell of a grid that the surface crosses gives one vertex, every edge that it crosses a
     quadrilateral between the four cells around it. Newton's method then puts the vertices onto the surface.
     """
     low, high = np.asarray(low, float), np.asarray(high, float)
     values = _sample(f, low, np.ceil((high - low) / step / BLOCK).astype(int), step)
     inside = _untangle(values) < 0
-    count = sum(inside[_shift(c, inside.shape)].astype(np.uint8) for c in itertools.product((0, 1), repeat=3))
+    count = np.asarray(sum(inside[_shift(c, inside.shape)].astype(np.uint8) for c in itertools.product((0, 1), repeat=3)))
     mixed = (count > 0) & (count < 8)
-    number = np.cumsum(mixed).reshape(mixed.shape) - 1
+    index = np.cumsum(mixed).reshape(mixed.shape) - 1
     cells = np.argwhere(mixed)
     p = low + step * _cell_points(values, cells)
     for _ in range(3):
@@ -114,7 +120,7 @@ def surface(f, low, high, step: float) -> Mesh:
         p -= (f(p) / np.maximum((g**2).sum(-1), 1e-12))[:, None] * g
         # In its cell, no vertex meets another.
         p = np.clip(p, low + step * (cells + 0.005), low + step * (cells + 0.995))
-    a, b, c, d = p[quads := _quads(inside, number)].transpose(1, 0, 2)
+    a, b, c, d = p[quads := _quads(inside, index)].transpose(1, 0, 2)
     # The shorter diagonal gives the better triangles.
     flip = np.linalg.norm(a - c, axis=-1) > np.linalg.norm(b - d, axis=-1)
     quads[flip] = np.roll(quads[flip], 1, axis=1)
@@ -179,7 +185,7 @@ def _cell_points(values, cells):
     return total / count[:, None]
 
 
-def _quads(inside, number):
+def _quads(inside, index):
     """[Q, 4] cells around each edge of the grid that the surface crosses, counter-clockwise seen from outside."""
     quads = []
     for axis in range(3):
@@ -187,7 +193,7 @@ def _quads(inside, number):
         start, end = _shift((0, 0, 0), inside.shape), _shift(e, inside.shape)
         edge = np.argwhere(inside[start] != inside[end])
         edge = edge[(edge @ u > 0) & (edge @ v > 0)]
-        around = np.stack([number[tuple((edge - o).T)] for o in (u + v, v, 0 * u, u)], -1)
+        around = np.stack([index[tuple((edge - o).T)] for o in (u + v, v, 0 * u, u)], -1)
         outward = inside[tuple(edge.T)]
         quads.append(np.where(outward[:, None], around, around[:, ::-1]))
     return np.concatenate(quads)

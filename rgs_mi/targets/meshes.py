@@ -1,25 +1,31 @@
 """Triangle meshes from smooth surfaces: grids, tubes, lathes. Faces are counter-clockwise seen from outside."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
+
+#: A function from points [N, 3] to numbers [N].
+Field = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices [V, 3] float32, faces [F, 3] uint32, normals [V, 3] float32 (unit, outward, smooth)."""
+    """A triangle mesh: ``vertices`` [V, 3] float32, ``faces`` [F, 3] uint32, ``normals`` [V, 3] float32 (unit, outward,
+    smooth)."""
 
     vertices: np.ndarray
     faces: np.ndarray
     normals: np.ndarray
 
     def select(self, keep: np.ndarray) -> "Mesh":
-        """The faces where ``keep`` [F] is true, with the normals of the whole surface."""
+        """Return the faces where ``keep`` [F] is true, with the normals of the whole surface."""
         used, faces = np.unique(self.faces[keep], return_inverse=True)
         return Mesh(self.vertices[used], faces.reshape(-1, 3).astype(np.uint32), self.normals[used])
 
     def cut(self, value: np.ndarray) -> "Mesh":
-        """The same surface with edges along the curve where ``value`` [V] is zero; what is closed stays closed.
+        """Return the same surface with edges along the curve where ``value`` [V] is zero; what is closed stays closed.
 
         Where the curve passes close to a vertex it goes through the vertex, so that no sliver loses its area to rounding.
         """
@@ -59,9 +65,9 @@ class Mesh:
             np.concatenate([self.normals, unit(mix(self.normals)).astype(np.float32)]),
         )
 
-    def moved(self, offset) -> "Mesh":
-        """Shifted by ``offset`` [3]."""
-        return Mesh(self.vertices + np.float32(offset), self.faces, self.normals)
+    def moved(self, offset: npt.ArrayLike) -> "Mesh":
+        """Return the mesh shifted by ``offset`` [3]."""
+        return Mesh(self.vertices + np.asarray(offset, np.float32), self.faces, self.normals)
 
 
 def _straddling(sides: np.ndarray) -> np.ndarray:
@@ -71,15 +77,15 @@ def _straddling(sides: np.ndarray) -> np.ndarray:
 
 def _rotated(faces: np.ndarray, first: np.ndarray) -> np.ndarray:
     """[3, F] corners of faces [F, 3], each from the corner ``first`` [F] on."""
-    return faces[np.arange(len(faces))[:, None], (first[:, None] + [0, 1, 2]) % 3].T
+    return faces[np.arange(len(faces))[:, None], (first[:, None] + np.arange(3)) % 3].T
 
 
-def divide(mesh: Mesh, regions, rest: str) -> dict[str, Mesh]:
-    """A surface cut into named parts with crisp borders.
+def divide(mesh: Mesh, regions: Sequence[tuple[str, Sequence[Field]]], rest: str) -> dict[str, Mesh]:
+    """Cut a surface into named parts with crisp borders.
 
     Args:
-      regions: (name, fields) pairs; a region is where all its fields, callables from points [N, 3] to [N], are
-               negative. Where regions overlap, the first has it; a name may occur several times
+      regions: (name, fields) pairs; a region is where all its fields are negative. Where regions overlap, the first has it;
+               a name may occur several times
       rest:    name of what no region has
     """
     for field in dict.fromkeys(field for _, fields in regions for field in fields):
@@ -92,20 +98,20 @@ def divide(mesh: Mesh, regions, rest: str) -> dict[str, Mesh]:
     return {name: mesh.select(owner == k) for k, name in enumerate(names)}
 
 
-def between(coordinate, low: float, high: float):
-    """Two fields for `divide`: where a coordinate (callable, [N, 3] to [N]) is between two values."""
+def between(coordinate: Field, low: float, high: float) -> tuple[Field, Field]:
+    """Return two fields for `divide`: where a coordinate is between two values."""
     return (lambda p: low - coordinate(p)), (lambda p: coordinate(p) - high)
 
 
 def unit(v: np.ndarray) -> np.ndarray:
-    """[..., 3] vectors scaled to length 1 (0 stays 0)."""
+    """Scale vectors [..., 3] to length 1; 0 stays 0."""
     return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-20)
 
 
 def weld(points: np.ndarray, faces: np.ndarray) -> Mesh:
-    """A mesh of points [N, 3] and faces [F, 3] in which equal points are one vertex and flat faces are gone.
+    """Return a mesh of ``points`` [N, 3] and ``faces`` [F, 3] in which equal points are one vertex and flat faces are gone.
 
-    A vertex normal is the sum of its faces' area vectors, normalised.
+    A vertex normal is the sum of its faces' area vectors, normalized.
     """
     keys, index, inverse = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
     vertices, faces = points[index], inverse.reshape(-1)[faces]
@@ -117,9 +123,9 @@ def weld(points: np.ndarray, faces: np.ndarray) -> Mesh:
 
 
 def grid_faces(rows: int, columns: int) -> np.ndarray:
-    """[2 * (rows - 1) * (columns - 1), 3] faces between the points of a grid, row by row.
+    """Return the faces between the points of a grid, row by row: [2 (rows − 1) (columns − 1), 3].
 
-    Outside is where (along a row) x (down a column) points.
+    Outside is where (along a row) × (down a column) points.
     """
     i = np.arange((rows - 1) * columns).reshape(rows - 1, columns)[:, :-1].ravel()
     a, b, c, d = i, i + 1, i + columns, i + columns + 1
@@ -127,17 +133,18 @@ def grid_faces(rows: int, columns: int) -> np.ndarray:
 
 
 def grid(points: np.ndarray) -> Mesh:
-    """The surface through points [R, C, 3]. Seams and poles close because their points coincide."""
+    """Return the surface through ``points`` [R, C, 3]. Seams and poles close because their points coincide."""
     return weld(points.reshape(-1, 3), grid_faces(*points.shape[:2]))
 
 
-def tube(curve: np.ndarray, up: np.ndarray, width, height, sides: int = 32) -> Mesh:
-    """A tube around a curve, with elliptical cross-sections; closed where the curve or its sizes close it.
+def tube(curve: np.ndarray, up: np.ndarray, width: npt.ArrayLike, height: npt.ArrayLike, sides: int = 32) -> Mesh:
+    """Return a tube around a curve, with elliptical cross-sections; closed where the curve or its sizes close it.
 
     Args:
-      curve: [N, 3] centres; a loop repeats its first point at the end
+      curve: [N, 3] centers; a loop repeats its first point at the end
       up:    [N, 3] or [3] direction of the height, made perpendicular to the curve
-      width, height: [N] or float, half axes of the ellipse
+      width, height: [N] or one number, half axes of the ellipse
+      sides: points around it
     """
     first, last = curve[0], curve[-1]
     if np.allclose(first, last):
@@ -147,9 +154,9 @@ def tube(curve: np.ndarray, up: np.ndarray, width, height, sides: int = 32) -> M
     tangent = unit(padded[2:] - padded[:-2])
     side = unit(np.cross(tangent, np.broadcast_to(up, curve.shape)))
     up = np.cross(side, tangent)
-    width, height = (np.broadcast_to(x, len(curve))[:, None, None] for x in (width, height))
+    half_width, half_height = (np.broadcast_to(x, len(curve))[:, None, None] for x in (width, height))
     c, s = _circle(sides)
-    return grid((padded[1:-1, None] + width * c * side[:, None] + height * s * up[:, None])[:, ::-1])
+    return grid((padded[1:-1, None] + half_width * c * side[:, None] + half_height * s * up[:, None])[:, ::-1])
 
 
 def _circle(sides: int) -> np.ndarray:
@@ -158,8 +165,9 @@ def _circle(sides: int) -> np.ndarray:
     return np.stack([np.cos(a), np.sin(a)])[..., None]
 
 
-def lathe(profile: np.ndarray, origin: np.ndarray, axis: np.ndarray, sides: int = 96) -> Mesh:
-    """A solid of revolution: profile [N, 2] of (radius, height along the axis), from the top down."""
+def lathe(profile: np.ndarray, origin: np.ndarray, axis: npt.ArrayLike, sides: int = 96) -> Mesh:
+    """Return a solid of revolution about the ``axis`` [3] through ``origin`` [3]: ``profile`` [N, 2] is (radius, height along
+    the axis), from the top down."""
     axis = unit(np.asarray(axis, float))
     x = unit(np.cross(axis, [0.0, 0, 1] if abs(axis[2]) < 0.9 else [1.0, 0, 0]))
     y = np.cross(axis, x)
@@ -168,23 +176,23 @@ def lathe(profile: np.ndarray, origin: np.ndarray, axis: np.ndarray, sides: int 
     return grid((origin + r * (c * x + s * y) + h * axis)[:, ::-1])
 
 
-def rounded(corners, cuts, steps: int = 8) -> np.ndarray:
-    """A profile [N, 2] for `lathe`: the polyline through corners [C, 2] with each corner rounded off.
+def rounded(corners: npt.ArrayLike, cuts: npt.ArrayLike, steps: int = 8) -> np.ndarray:
+    """Return a profile [N, 2] for `lathe`: the polyline through ``corners`` [C, 2] with each corner rounded off in ``steps``.
 
-    cuts: float or [C], how far from the corner its arc begins; at most half a side.
+    ``cuts`` (one number or [C]) say how far from the corner its arc begins; at most half a side.
     """
     corners = np.asarray(corners, float)
     sides = np.linalg.norm(np.diff(corners, axis=0), axis=1)
-    cuts = np.minimum(np.broadcast_to(cuts, len(corners))[1:-1], 0.5 * np.minimum(sides[1:], sides[:-1]))[:, None, None]
+    cut = np.minimum(np.broadcast_to(cuts, len(corners))[1:-1], 0.5 * np.minimum(sides[1:], sides[:-1]))[:, None, None]
     before, corner, after = (x[:, None] for x in (corners[:-2], corners[1:-1], corners[2:]))
     t = np.linspace(0, 1, steps)[:, None]
-    start, end = cuts * unit(before - corner), cuts * unit(after - corner)
+    start, end = cut * unit(before - corner), cut * unit(after - corner)
     arcs = corner + (1 - t) ** 2 * start + t**2 * end
     return np.vstack([corners[:1], arcs.reshape(-1, 2), corners[-1:]])
 
 
 def join(*meshes: Mesh) -> Mesh:
-    """Several meshes as one."""
+    """Return several meshes as one."""
     offsets = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
     return Mesh(
         np.concatenate([m.vertices for m in meshes]),
@@ -194,6 +202,6 @@ def join(*meshes: Mesh) -> Mesh:
 
 
 def mirrored(mesh: Mesh) -> Mesh:
-    """The mirror image through the plane y = 0."""
-    flip = np.float32([1, -1, 1])
+    """Return the mirror image through the plane y = 0."""
+    flip = np.array([1, -1, 1], np.float32)
     return Mesh(mesh.vertices * flip, mesh.faces[:, ::-1].copy(), mesh.normals * flip)

@@ -177,7 +177,7 @@ def test_constant_map_to_start_from():
     emitter = mi.load_dict({"type": "procedural_envmap", "name": "constant", "radiance": 0.3, "height": 10})
     data = mi.traverse(emitter)["data"].numpy()
     assert data.shape == (10, 22, 3) and np.allclose(data, 0.3)
-    with pytest.raises(RuntimeError, match="rows is 1"):
+    with pytest.raises(RuntimeError, match="height is 1"):
         mi.load_dict({"type": "procedural_envmap", "name": "constant", "height": 1})
 
 

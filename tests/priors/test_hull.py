@@ -136,7 +136,7 @@ def test_coarse_to_fine_skips_nothing(data):
 
 @pytest.mark.parametrize("size", [32, 100])
 @pytest.mark.parametrize("count, peak", [(8, 1.12), (16, 1.06), (30, 1.03)])  # cones of few views leave peaks
-@pytest.mark.parametrize("centre", [(0, 0, 0), (400, -300, 250)])
+@pytest.mark.parametrize("center", [(0, 0, 0), (400, -300, 250)])
 def test_object_that_fills_the_frame(size, count, peak, center):
     """As `rgs_mi.datasets.path_traced` photographs objects: space that no frame shows is carved all the same."""
     center, distance = np.array(center, float), path_traced.MARGIN / np.sin(np.radians(path_traced.FOV / 2))

@@ -75,11 +75,11 @@ def test_hull(name):
 # ---- Maps ----
 
 
-def test_inside_and_outlined():
+def test_inside_and_masked():
     v = view()
     values = np.ones(SIZE[::-1])
     values[20, 24], values[20, 25], values[20, 26] = np.inf, np.nan, 1e300
-    out = maps.outlined(values, v)
+    out = maps.masked(values, v)
     assert out.dtype == np.float32 and np.isnan(out[20, 24:27]).all() and np.isnan(out[0, 0]) and out[20, 20] == 1
     linear = View("x", v.camera, v.pixels.astype(np.float32) / 255, True, None, None)
     np.testing.assert_array_equal(maps.inside(linear), maps.inside(v))

@@ -154,15 +154,15 @@ def test_views_that_agree_by_chance_do_not_count():
     assert around[:50] == pytest.approx((near * agreed).sum(1) / near.sum(1), abs=0.02)
 
 
-def test_alikeness_is_what_loops_say():
+def test_photo_consistency_is_what_loops_say():
     """Every correlation of a few pixels, window by window, in NumPy."""
     every = textured_tray()
     views = every[:5]
-    small = [stereo.Small.of(view) for view in views]
+    small = [stereo.SmallImage.of(view) for view in views]
     mesh = hull.surface(hull.visual_hull(every, 48))
     depths = hull.depth_maps(*mesh[:2], [s.camera for s in small])
     level, margin = np.array([-0.02, 0.05, 0.2]), 0.03
-    mine = stereo.alikeness(small[0], depths[0], level, list(zip(small[1:], depths[1:])), margin)
+    mine = stereo.photo_consistency(small[0], depths[0], level, list(zip(small[1:], depths[1:])), margin)
     rng = np.random.default_rng(0)
     inner = np.argwhere(ndimage.binary_erosion(np.isfinite(depths[0]), iterations=4))
     for row, column in inner[rng.permutation(len(inner))[:25]]:
