@@ -1,9 +1,9 @@
 """What each part of RGS brings: variants of the settings fitted to a suite of scenes, as tables beside the paper's and as
-pictures. What `scripts/ablate.py` calls.
+pictures. What `rgs-mi ablate` calls.
 
     OUT/ablation.md, .csv, .json     every fit's figures, and means; written again after each fit
     OUT/SCENE.png                    a few test views: the truth and all variants, normals below
-    OUT/SCENE/VARIANT[-SEED]/        the runs, as `scripts/optimize.py` makes them
+    OUT/SCENE/VARIANT[-SEED]/        the runs, as `rgs-mi optimize` makes them
 """
 
 import itertools

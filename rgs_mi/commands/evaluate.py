@@ -1,5 +1,5 @@
 """A run judged again on the photographs that it held out: when LPIPS's weights were installed later, or on another machine.
-What `scripts/evaluate.py` calls.
+What `rgs-mi evaluate` calls.
 
 What is judged is the scene that the run exported, not a checkpoint of the fit: it is what people use and pass on, says by
 itself how it is shaded, and is there when checkpoints are deleted. Both give the same figures, to rounding.
@@ -28,7 +28,7 @@ _FACTS = {
     "iterations": int,
     "surfels": int,
     "parameters": int,
-    "peak_rss_mb": (int, float),
+    "peak_rss_mb": (int, float, type(None)),
     "train_views": int,
     "test_views": int,
     "settings": dict,

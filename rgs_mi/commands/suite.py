@@ -1,9 +1,9 @@
 """A suite of captures, each fitted once and judged on its held-out views: tables beside the paper's, and a page. What
-`scripts/benchmark.py suite` calls.
+`rgs-mi benchmark suite` calls.
 
     OUT/suite.md, .csv, .json     the paper's tables with ours beside them, every scene's figures; written after each fit
     OUT/suite.html                the same with pictures (`report`)
-    OUT/SCENE/                    the runs, as `scripts/optimize.py` makes them
+    OUT/SCENE/                    the runs, as `rgs-mi optimize` makes them
 """
 
 import sys

@@ -3,7 +3,6 @@
 import json
 import os
 import platform
-import resource
 import shlex
 import sys
 
@@ -14,6 +13,7 @@ import numpy as np
 from .. import __version__, report
 from ..core.files import atomic_file
 from ..core.progress import Progress
+from ..core.runtime import peak_rss_mb
 from ..evaluation import evaluate, lpips, pictures
 from ..export.mitsuba_scene import export
 from ..settings.config import to_dict
@@ -123,7 +123,7 @@ def _facts(fit) -> dict:
         "iterations": fit.step_number,
         "surfels": len(fit.model),
         "parameters": sum(fit.model.numpy(name).size for name in fit.model.optimizer.keys()),
-        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_rss_mb": peak_rss_mb(),
         "train_views": len(fit.dataset.train),
         "test_views": len(fit.dataset.test),
         "photographs": str(fit.dataset.root.resolve()),
