@@ -64,9 +64,9 @@ def expected(cls, location) -> str:
 
 
 def section_at(cls, location) -> type | None:
-    """The model at ``location`` in the model ``cls``, None where there is none."""
+    """The model at ``location`` in the model ``cls``; None where something else stands."""
     found = _at(cls, location)
-    return found and section(found[0])
+    return section(found[0]) if found else None
 
 
 def _at(annotation, location, metadata=()):

@@ -83,9 +83,11 @@ class Weights:
         default=(0.05, 0.6),
         description="Depth-normal consistency (2DGS), first and last, joined geometrically: early it would hold surfaces back.",
     )
-    distortion: float = Field(default=0.0, ge=0, le=1e6, description="Distance between the surfels along a ray (2DGS).")
+    distortion: float = Field(
+        default=0.0, ge=0, le=1e6, description="Distance of the surfels along a ray from each other (2DGS)."
+    )
     normal: float = Field(
-        default=0.1, ge=0, le=1e3, description="Smoothness of the normals of what reflects (RGS, L_normal)."
+        default=0.1, ge=0, le=1e3, description="Smoothness of the normals of what is reflective (RGS, L_normal)."
     )
     crease: float = Field(
         default=0.1,
@@ -180,7 +182,7 @@ class Settings:
         description="Fraction of the fit from which normals that start on the hull move at their rates; before, at a tenth.",
     )
     cooldown: float = Field(
-        default=0.05, ge=0, le=1, description="The last fraction of a fit, in which all rates fall to zero."
+        default=0.05, ge=0, le=1, description="The last fraction of the fit, in which all rates fall to zero."
     )
     box: tuple[float, float, float, float, float, float] | None = Field(
         default=None,
@@ -215,7 +217,7 @@ class Settings:
     monte_carlo_samples: int = Field(default=4, ge=1, le=4096, description="Samples a pixel of `monte_carlo`.")
     sh_order: int = Field(default=2, ge=0, le=3, description="Order of the spherical harmonics of the diffuse radiance.")
     sh_start: float = Field(
-        default=0.4, ge=0, le=1, description="Fraction of the fit from which diffuse light depends on the view."
+        default=0.4, ge=0, le=1, description="Fraction of the fit from which view-dependent diffuse is learned."
     )
     checkpoint_seconds: float = Field(default=20.0, ge=0, le=1e6, description="Seconds from one checkpoint to the next.")
     stages: tuple[Stage, ...] = Field(
