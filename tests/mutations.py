@@ -31,7 +31,7 @@ MUTATIONS = {
     "the light turned by 90°": (
         "shading/environment.py",
         "longitude -= dr.floor(longitude)",
-        "longitude = dr.abs(longitude - 0.25)",
+        "longitude -= 0.25",
     ),
     "a tap's weight": ("shading/split_sum.py", "incoming += w *", "incoming += 1.05 * w *"),
     "Fresnel's term of metals": (

@@ -37,6 +37,16 @@ SETTINGS = [
     "checkpoint_seconds=1000",
 ]
 SEED = 0
+#: Mean and standard deviation of eight seeds, 0 to 7. They lay within 28.98 to 29.30 dB, and within 2.92° to 3.00°.
+MEASURED = {"psnr": (29.14, 0.105), "normal_mae_deg": (2.962, 0.025)}
+MARGIN = 4  # standard deviations. A change for the better is to be recorded, too
+
+
+def test_a_short_fit_is_as_good_as_it_was(tmp_path):
+    figures = measure(make(tmp_path), tmp_path, SEED)
+    for name, (mean, spread) in MEASURED.items():
+        assert abs(figures[name] - mean) < MARGIN * spread, f"{name} is {figures[name]:.3f}: {mean} ± {MARGIN} × {spread}"
+    assert figures["surfels"] > 1500  # density control was at work
 
 
 def make(folder: Path):
@@ -72,16 +82,9 @@ def main(*seeds):
                 f"{f['train_seconds']:.0f} s",
                 flush=True,
             )
-        print(
-            "mean",
-            np.mean(found, 0),
-            "standard deviation",
-            np.std(found, 0, ddof=1),
-            "least",
-            np.min(found, 0),
-            "most",
-            np.max(found, 0),
-        )
+        for k, name in enumerate(MEASURED):
+            values = np.array(found)[:, k]
+            print(f"{name}: {values.mean():.4g} ± {values.std(ddof=1):.2g}, {values.min():.4g} to {values.max():.4g}")
 
 
 if __name__ == "__main__":
