@@ -13,11 +13,12 @@ project, author = "rgs_mi", "the rgs_mi authors"
 copyright = "2026, the rgs_mi authors"
 version = release = rgs_mi.__version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "api_pages", "plugin_pages", "settings_table"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "api_pages", "plugin_pages", "settings_table"]
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = f"rgs_mi {version}"
 
+nb_execution_mode = "off"  # tests/test_notebook.py runs it; what it shows is of the helmet's nine minutes
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
 

@@ -72,11 +72,11 @@ from rgs_mi.plugins.surfels import box_of, resolve, surfels_in
 from rgs_mi.core.camera import Camera
 from rgs_mi.core.errors import UserError
 from rgs_mi.shading import deferred, indirect
+from rgs_mi.shading.deferred import Shading
 from rgs_mi.shading.environment import Environment
-from rgs_mi.shading.monte_carlo import SAMPLES, MonteCarlo
+from rgs_mi.shading.lighting import lighting_of
+from rgs_mi.shading.monte_carlo import SAMPLES
 from rgs_mi.shading.shader import Shader
-from rgs_mi.shading.split_sum import SplitSum
-from rgs_mi.surfels.proxies import Proxies
 
 AOVS = {
     "depth": "T",
@@ -164,18 +164,8 @@ class DeferredIntegrator(mi.SamplingIntegrator):
 
     def lighting(self, scene, surfels, eta, environment, seed):
         """By what `deferred.shade` shades ``surfels`` in the ``scene``, whose `environment` this is; None: nothing."""
-        if self.specular == "none":
-            return None
-        each_other = None
-        if self.indirect != "none":
-            each_other = indirect.Indirect(self.indirect, Proxies(surfels, box=self.box), surfels)
-        if self.specular == "split_sum":
-            estimator = SplitSum(environment, eta)
-        else:
-            estimator = MonteCarlo(environment, scene.environment(), eta, self.samples, dr.opaque(mi.UInt32, seed))
-        lit = self.diffuse == "lit"
-        lighting = deferred.Lighting(estimator, self.shader, each_other, lit, self.box)
-        return lighting.with_irradiance_visibility() if lit and each_other and self.specular == "split_sum" else lighting
+        shading = Shading(self.specular, self.diffuse, self.samples, eta, self.box, self.indirect)
+        return lighting_of(shading, surfels, environment, scene.environment(), self.shader, seed)
 
     def environment(self, scene):
         """The scene's environment, filtered as the estimator needs it; kept until texels change."""

@@ -1,6 +1,6 @@
 """
 Values of a wavefront as a texture (:monosp:`wavefront`)
------------------------------------------------------
+--------------------------------------------------------
 
 Lane *k* of an evaluation sees entry *k* of ``values``, whatever the surface: so a BSDF of Mitsuba's can be
 evaluated for many materials at once, each lane its own. Set ``values`` before each evaluation; its width must be one or that

@@ -1,9 +1,9 @@
 """What each part of RGS brings: variants of the settings fitted to a suite of scenes, as tables beside the paper's and as
-pictures. What `scripts/ablate.py` calls.
+pictures. What `rgs-mi ablate` calls.
 
     OUT/ablation.md, .csv, .json     every fit's figures, and means; written again after each fit
     OUT/SCENE.png                    a few test views: the truth and all variants, normals below
-    OUT/SCENE/VARIANT[-SEED]/        the runs, as `scripts/optimize.py` makes them
+    OUT/SCENE/VARIANT[-SEED]/        the runs, as `rgs-mi optimize` makes them
 """
 
 import itertools
@@ -15,7 +15,8 @@ from pathlib import Path
 from ..core.errors import UserError
 from ..core.subprocesses import apart
 from ..fit.scene import FitScene
-from ..report.comparison import mean_tables, means, picture, scene_table
+from ..report import pictures
+from ..report.tables import mean_tables, means, scene_table
 from ..settings.config import presets, to_dict
 from .jobs import Job, budget, check_names, check_photographs, effort, find_scenes, fit, photographs, rows_of, write_tables
 
@@ -190,7 +191,7 @@ def _fit_scene(group, jobs, errors, xml, out, quiet):
         ]
         try:
             if shown:
-                picture(out / f"{scene}.png", views, shown, group[0].settings["background"])
+                pictures.write(out / f"{scene}.png", views, shown, group[0].settings["background"])
         except Exception as error:  # of a damaged run
             warnings.warn(f"{out / scene}: no picture ({type(error).__name__}: {error})", stacklevel=2)
 

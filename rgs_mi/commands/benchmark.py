@@ -1,4 +1,4 @@
-"""How long things take: the splatter against another implementation, and a step of a fit. What `scripts/benchmark.py`
+"""How long things take: the splatter against another implementation, and a step of a fit. What `rgs-mi benchmark`
 calls; all times are medians of warm calls, in milliseconds."""
 
 import re

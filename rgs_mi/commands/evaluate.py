@@ -1,5 +1,5 @@
 """A run judged again on the photographs that it held out: when LPIPS's weights were installed later, or on another machine.
-What `scripts/evaluate.py` calls.
+What `rgs-mi evaluate` calls.
 
 What is judged is the scene that the run exported, not a checkpoint of the fit: it is what people use and pass on, says by
 itself how it is shaded, and is there when checkpoints are deleted. Both give the same figures, to rounding.
@@ -20,8 +20,6 @@ from ..export.mitsuba_scene import SCENE, sensor_id
 from ..fit.curves import Curves
 from ..plugins import lit_surfels
 from ..report import results
-from ..settings.config import completed
-from ..settings.settings import Settings
 from ..shading.environment import Environment
 
 _FACTS = {
@@ -30,7 +28,7 @@ _FACTS = {
     "iterations": int,
     "surfels": int,
     "parameters": int,
-    "peak_rss_mb": (int, float),
+    "peak_rss_mb": (int, float, type(None)),
     "train_views": int,
     "test_views": int,
     "settings": dict,
@@ -90,8 +88,8 @@ def _keep_lpips(saved, mean, scores):
 
 def _background(saved, run):
     try:
-        background = float(completed(Settings, saved["settings"])["background"])
-    except (AttributeError, TypeError, ValueError):
+        background = float(saved["settings"]["background"])
+    except (KeyError, TypeError, ValueError):
         background = np.nan
     if not 0 <= background <= 1:
         raise UserError(f"{run / results.METRICS}: its settings have no background from 0 to 1: it is damaged")

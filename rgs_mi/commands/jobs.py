@@ -1,7 +1,6 @@
 """Fits of a suite of scenes, each done once and gone on with where it was interrupted: what `ablate` and `suite` share."""
 
 import contextlib
-import csv
 import hashlib
 import io
 import json
@@ -16,9 +15,7 @@ from ..datasets import is_capture, looked_for
 from ..fit import checkpoint
 from ..fit.scene import FitScene
 from ..report import results
-from ..report.comparison import DETAILS, FIGURES
-from ..settings.config import completed
-from ..settings.settings import Settings
+from ..report.tables import DETAILS, FIGURES, csv_text
 from .optimize import optimize
 
 _DIGEST = "photographs.sha256"  # beside or above the fits: what they are of
@@ -45,7 +42,7 @@ class Job:
 
     def has(self, saved: dict) -> bool:
         """Whether the settings ``saved`` with a fit are this job's."""
-        return completed(Settings, saved) == self.settings
+        return saved == self.settings
 
     def figures(self) -> dict | None:
         """metrics.json of the finished fit; None where there is none, or one with other settings."""
@@ -126,7 +123,7 @@ def fit(xml, job, quiet):
 
 
 def rows_of(jobs, errors) -> list[dict]:
-    """A row (see `comparison`) for each fit that is there or was asked for; ``errors``: {folder: what went wrong}."""
+    """A row (see `tables`) for each fit that is there or was asked for; ``errors``: {folder: what went wrong}."""
     rows = []
     for job in jobs:
         error = errors.get(job.folder)
@@ -144,14 +141,11 @@ def rows_of(jobs, errors) -> list[dict]:
 def write_tables(out, name, sections, rows, told) -> list[Path]:
     """Write ``OUT/NAME.md`` (``sections`` of text), ``.csv`` (the ``rows``) and ``.json`` (the rows as ``runs``, and what
     else is ``told``); returns their paths."""
-    lines = io.StringIO()
-    writer = csv.DictWriter(lines, ("scene", "variant", "seed", "status", *FIGURES, *DETAILS, "error"))
-    writer.writeheader()
-    writer.writerows(rows)
+    columns = ("scene", "variant", "seed", "status", *FIGURES, *DETAILS, "error")
     paths = []
     for suffix, text in {
         "md": "\n\n".join(sections) + "\n",
-        "csv": lines.getvalue(),
+        "csv": csv_text(rows, columns),
         "json": json.dumps({"runs": rows} | told, indent=1) + "\n",
     }.items():
         paths.append(Path(out) / f"{name}.{suffix}")

@@ -1,4 +1,4 @@
-"""A fit from beginning to end: photographs and scene in, a run's folder out. What `scripts/optimize.py` calls."""
+"""A fit from beginning to end: photographs and scene in, a run's folder out. What `rgs-mi optimize` calls."""
 
 import shutil
 import sys
@@ -14,6 +14,7 @@ from ..core.errors import UserError
 from ..core.files import make_folder
 from ..core.interrupt import GracefulInterrupt
 from ..core.progress import Progress
+from ..core.runtime import cache_folder
 from ..fit import checkpoint
 from ..fit.events import Events
 from ..fit.model import Model
@@ -22,10 +23,8 @@ from ..fit.trainer import Fit
 from ..priors import depth_priors
 from ..priors.initialization import initial_points, surroundings
 from ..report import results
-from ..settings.config import completed, to_dict
-from ..settings.settings import Settings
+from ..settings.config import to_dict
 
-_PRIORS = Path("data") / "priors"  # what is known of depths is kept here, below the current folder
 _ON_SURFACE, _ANYWHERE = 0.7, 0.1  # opacities to start with; where surfels fill space, more would hide what is within
 _SMOOTHING = 0.95  # of the PSNR that the progress line shows
 
@@ -147,7 +146,7 @@ def _priors(dataset, settings):
     """The depth prior of each training view, or None."""
     if settings.weights.depth == 0:
         return None
-    return depth_priors(settings.prior.name, dataset.train, cache=_PRIORS, **settings.prior.options)
+    return depth_priors(settings.prior.name, dataset.train, cache=cache_folder("priors"), **settings.prior.options)
 
 
 def _resume(saved, scene, dataset, settings) -> Fit:
@@ -155,7 +154,7 @@ def _resume(saved, scene, dataset, settings) -> Fit:
     arrays, meta = saved
     if meta["photographs"] != _photographs(dataset):
         raise UserError(f"{dataset.root}: not the photographs of the checkpoint: give its --data, or another --out")
-    old, new = _flat(completed(Settings, meta["settings"])), _flat(to_dict(settings))
+    old, new = _flat(meta["settings"]), _flat(to_dict(settings))
     changed = [key for key in new if old.get(key) != new[key]]
     if fixed := [key for key in ("sh_order", "shader") if key in changed]:
         raise UserError(f"{fixed[0]} is {old[fixed[0]]} in the checkpoint and can't change: choose another --out")

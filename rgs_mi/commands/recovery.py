@@ -1,5 +1,5 @@
 """How true a fit's light and materials are: against the path-traced scene that its photographs are of, and under other
-lights. What `scripts/recovery.py` calls.
+lights. What `rgs-mi recovery` calls.
 
     OUT/recovery.json       the figures below
     OUT/relit_NAME.png      a few views under each light: the truth, the fit, three times their difference
@@ -20,6 +20,7 @@ import numpy as np
 
 from ..core.arrays import as_float
 from ..core.files import atomic_file, write_png
+from ..core.runtime import cache_folder
 from ..core.scene_files import load_scene, spp_of
 from ..datasets import load_dataset
 from ..datasets.path_traced import render_dataset
@@ -28,7 +29,6 @@ from ..evaluation.evaluate import ground_truth
 from ..export.mitsuba_scene import SCENE
 from ..export.relight import relight
 from ..export.render import sensor_dict, straight, with_aovs
-from ..fit.scene import RENDERED
 from ..plugins import surfels_of
 from ..report.results import preview_views
 from ..shading.environment import Environment
@@ -44,7 +44,7 @@ def recovery(run, truth, lights=(), *, size=400, out=None, quiet=False) -> dict:
     ``lights``, environments of the suite.
 
     Args:
-      size: pixels along a side of the path-traced views, which are kept below ``data``
+      size: pixels along a side of the path-traced views, which are kept in the `cache_folder`
       out:  folder (None: ``recovery`` in ``run``)
 
     Raises: UserError for scenes that do not load, and where a file can't be written.
@@ -68,7 +68,7 @@ def recovery(run, truth, lights=(), *, size=400, out=None, quiet=False) -> dict:
 
 def _views(truth, variables, size, quiet):
     """Path-traced views of the scene with its light, or another."""
-    folder = RENDERED / "-".join([truth.stem, "truth", *variables.values()])
+    folder = cache_folder("-".join([truth.stem, "truth", *variables.values()]))
     render_dataset(truth, folder, train=1, test=_VIEWS, size=size, variables=variables, quiet=quiet)
     return load_dataset(folder).test
 

@@ -1,9 +1,9 @@
 """A suite of captures, each fitted once and judged on its held-out views: tables beside the paper's, and a page. What
-`scripts/benchmark.py suite` calls.
+`rgs-mi benchmark suite` calls.
 
     OUT/suite.md, .csv, .json     the paper's tables with ours beside them, every scene's figures; written after each fit
     OUT/suite.html                the same with pictures (`report`)
-    OUT/SCENE/                    the runs, as `scripts/optimize.py` makes them
+    OUT/SCENE/                    the runs, as `rgs-mi optimize` makes them
 """
 
 import sys
@@ -13,8 +13,8 @@ from pathlib import Path
 from ..core.errors import UserError
 from ..core.subprocesses import each_apart
 from ..fit.scene import FitScene
-from ..report import published, write_suite
-from ..report.comparison import DETAILS, FIGURES, mean, scene_table
+from ..report import paper_results, write_suite
+from ..report.tables import DETAILS, FIGURES, mean, scene_table
 from ..settings.config import to_dict
 from .jobs import Job, budget, check_names, check_photographs, effort, find_scenes, fit, photographs, rows_of, write_tables
 
@@ -112,12 +112,12 @@ def _scene(xml, job, quiet):
 def _write(jobs, errors, out):
     """Write the tables: their text and paths."""
     rows = rows_of(jobs, errors)
-    ours = published.means(rows, [job.scene for job in jobs])
+    ours = paper_results.means(rows, [job.scene for job in jobs])
     finished = {(row["scene"], row["seed"]): row for row in rows if row["status"] == "finished"}
     listed = [(row["scene"], row) for row in rows]
     if finished:
         listed.append(("mean", {"seed": "", "status": "finished"} | mean(finished, (*FIGURES, *DETAILS))))
     introduction = f"{effort(jobs[0].settings)}; settings: {' '.join([jobs[0].variant, *jobs[0].overrides])}. {_REMARK}"
-    sections = ["# Suite", introduction, *published.tables(ours), "## Scenes", scene_table(listed)]
-    paths = write_tables(out, NAME, sections, rows, {"means": ours, "paper": published.PAPER})
+    sections = ["# Suite", introduction, *paper_results.tables(ours), "## Scenes", scene_table(listed)]
+    paths = write_tables(out, NAME, sections, rows, {"means": ours, "paper": paper_results.PAPER})
     return "\n\n".join(sections[1:]), paths

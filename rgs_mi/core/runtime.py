@@ -1,4 +1,4 @@
-"""Finds an LLVM that works, sets Mitsuba's variant: the only module that touches the environment.
+"""The machine: finds an LLVM that works, sets Mitsuba's variant, says where caches lie and how much memory was used.
 
 Dr.Jit's CPU backend loads libLLVM at run time. Version 15 loads and then aborts the process in ``dr.clip``; older ones
 are refused with a misleading message. On Linux x86-64 the wheel ``karellen-llvm-core`` brings a recent one into the
@@ -15,6 +15,7 @@ from .errors import UserError
 
 MIN_LLVM = 16
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
+CACHE_VARIABLE = "RGS_MI_CACHE"
 _VARIABLE = "DRJIT_LIBLLVM_PATH"
 _REMEDY = (
     f"install one (Debian: `apt install libllvm19`, macOS: `brew install llvm`, Linux x86-64: "
@@ -92,3 +93,19 @@ def set_variant(name: str = "llvm_ad_rgb") -> None:
             f"Dr.Jit had loaded LLVM {dr.detail.llvm_version()[0]} before rgs_mi could choose one: "
             "import rgs_mi before drjit and mitsuba"
         )
+
+
+def cache_folder(kind: str = "") -> Path:
+    """The folder ``kind`` of what takes long to compute and is kept, path-traced photographs, depth priors and undistorted
+    photographs: below the one that the environment variable `CACHE_VARIABLE` names, or ``data`` in the current folder."""
+    return Path(os.environ.get(CACHE_VARIABLE) or "data") / kind
+
+
+def peak_rss_mb() -> float | None:
+    """Most memory that this process has held, in MiB; None where the system does not say (Windows)."""
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)  # macOS counts bytes, Linux KiB

@@ -7,6 +7,29 @@ import mitsuba as mi
 
 from .errors import UserError
 
+_PACKAGE = Path(__file__).parents[1]
+
+
+def bundled(kind: str) -> dict[str, Path]:
+    """name -> file of the scenes that come with the package. ``kind``: 'scenes', those to fit, or 'targets', those that
+    photographs are path-traced from."""
+    beside = _PACKAGE / "scenes"  # of an installed wheel; a clone has it beside the package
+    folder = beside if beside.is_dir() else _PACKAGE.parent / "scenes"
+    return {path.stem: path for path in sorted((folder / "targets" if kind == "targets" else folder).glob("*.xml"))}
+
+
+def find_scene(name: str, kind: str) -> Path:
+    """What an argument names: a path, or else one of those `bundled` with the package.
+
+    Raises: UserError for a bare name that is neither.
+    """
+    path, known = Path(name), bundled(kind)
+    if path.exists() or path.suffix or len(path.parts) > 1:
+        return path
+    if name not in known:
+        raise UserError(f"no file or folder '{name}' here, and no scene of that name: choose one of {', '.join(known)}")
+    return known[name]
+
 
 def load_scene(path: str | Path, variables: dict[str, object]) -> "mi.Scene":
     """Load a scene file; ``variables`` override the scene's ``<default>``s. A variant must be active.

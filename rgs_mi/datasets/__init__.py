@@ -13,7 +13,7 @@ def load_dataset(root: str | Path) -> Dataset:
     """Load the capture in folder ``root``, in the first layout that it has: `blender`, `nerfstudio`, `colmap`, `nero`.
 
     World and cameras stay as in the files. Photographs of lenses with distortion are made those of pinholes
-    (`distortion.undistorted`, which keeps them below the current folder).
+    (`distortion.undistorted`, which keeps them).
     Raises: UserError when the folder is missing, has no known layout, or when a file in it is bad.
     """
     root = Path(root)

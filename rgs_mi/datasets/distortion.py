@@ -10,19 +10,16 @@ colour at (x', y'): no inverse is needed.
 """
 
 import hashlib
-import warnings
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
 
+from ..core.caches import cached_arrays
 from ..core.camera import Camera
 from ..core.color import srgb_decode, srgb_encode
-from ..core.errors import UserError
-from ..core.files import atomic_file
+from ..core.runtime import cache_folder
 
-CACHE = Path("data") / "undistorted"  # below the current folder
 _VERSION = 1  # of everything that decides what is in the pixels: a cached photograph of another version is not read
 _SRGB_TO_LINEAR = srgb_decode(np.arange(256) / 255).astype(np.float32)
 
@@ -61,22 +58,19 @@ def undistorted(pixels: np.ndarray, camera: Camera, distortion: Distortion, name
     """Return `View.pixels` as the pinhole ``camera`` sees them, [H, W, 4] of the same type.
 
     Bilinear, in linear light, weighted with alpha. Where the photograph shows nothing alpha is 0. The result is kept in
-    `CACHE` and found again by the pixels, the camera, the coefficients and the view's ``name``.
+    `cache_folder` and found again by the pixels, the camera, the coefficients and the view's ``name``.
     """
     digest = hashlib.sha256(
         repr((_VERSION, name, pixels.dtype, pixels.shape, camera.focal, camera.principal, distortion)).encode()
     )
     digest.update(np.ascontiguousarray(pixels))
-    path = CACHE / f"{digest.hexdigest()[:24]}.npz"
-    result = _load(path, pixels)
-    if result is None:
-        result = _resample(pixels, camera, distortion)
-        try:
-            with atomic_file(path) as stream:
-                np.savez_compressed(stream, pixels=result)
-        except UserError as error:  # a disk that takes no more costs the cache, not the result
-            warnings.warn(str(error), stacklevel=2)
-    return result
+    path = cache_folder("undistorted") / f"{digest.hexdigest()[:24]}.npz"
+
+    def check(arrays):
+        if (arrays["pixels"].shape, arrays["pixels"].dtype) != (pixels.shape, pixels.dtype):
+            raise ValueError("its shape or type is wrong")
+
+    return cached_arrays(path, check, lambda: {"pixels": _resample(pixels, camera, distortion)})["pixels"]
 
 
 def cropped_to_valid(pixels: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:
@@ -88,21 +82,6 @@ def cropped_to_valid(pixels: np.ndarray, camera: Camera) -> tuple[np.ndarray, Ca
         worst = int(np.argmax([window[0].mean(), window[-1].mean(), window[:, 0].mean(), window[:, -1].mean()]))
         top, bottom, left, right = top + (worst == 0), bottom - (worst == 1), left + (worst == 2), right - (worst == 3)
     return pixels[top:bottom, left:right], camera.cropped(left, top, right - left, bottom - top)
-
-
-def _load(path, pixels):
-    """The cached result for ``pixels``; None where it is missing or, with a warning, damaged."""
-    if not path.is_file():
-        return None
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            result = arrays["pixels"]
-        if (result.shape, result.dtype) != (pixels.shape, pixels.dtype):
-            raise ValueError("its shape or type is wrong")
-        return result
-    except Exception as error:  # a damaged zip fails in a dozen ways, and each means the same here
-        warnings.warn(f"{path} is damaged ({error}): undistorting the photograph again", stacklevel=2)
-        return None
 
 
 def _resample(pixels, camera, distortion):

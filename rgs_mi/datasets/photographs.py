@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
+from skimage.transform import downscale_local_mean
 
 from ..core.arrays import as_float
 from ..core.camera import Camera
@@ -100,7 +101,7 @@ def _windows(views, downscale):
 
 def _shrink(image, factor):
     """Mean over factor × factor blocks; the last rows and columns that fill no block are left out."""
-    height, width = (max(n // factor, 1) * factor if n >= factor else n for n in image.shape[:2])
     if factor == 1 or min(image.shape[:2]) < factor:
         return image
-    return image[:height, :width].reshape(height // factor, factor, width // factor, factor, -1).mean((1, 3))
+    height, width = (n - n % factor for n in image.shape[:2])
+    return downscale_local_mean(image[:height, :width], (factor, factor, 1))

@@ -1,10 +1,10 @@
 """What people look at: pictures of each test view, panels that take it apart, and one sheet that tells the whole fit."""
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
 
 from ..core.color import srgb_encode, to_8bit, tone_map
-from ..core.files import atomic_file, write_exr, write_png
+from ..core.files import write_exr, write_png
+from ..core.sheet import Sheet
 from . import metrics
 from .evaluate import Rendering, ground_truth
 
@@ -13,7 +13,6 @@ ERROR_RANGE, NORMAL_RANGE = 0.2, 20  # what the ramp of errors ends at: display 
 #: Colours of errors, from none to the largest, evenly spaced; from light to dark.
 RAMP = np.array([[255, 255, 255], [250, 214, 122], [235, 130, 56], [184, 51, 69], [84, 18, 74]]) / 255
 _PANEL, _GAP, _MARGIN, _TEXT = 280, 12, 32, 24  # pixels of the contact sheet
-_INK = (60, 60, 60)
 _ON_SHEET = (
     "photograph",
     "rendering",
@@ -112,32 +111,12 @@ def contact_sheet(path, rows, environment: np.ndarray, title: str, lines):
     """One picture of the fit: a row for each view's `panels` of ``rows``; below them the ``environment``
     [rows, columns, 3] and beside it ``lines`` of text."""
     names = [name for name in _ON_SHEET if any(name in row for row in rows)]
-    step, line = _PANEL + _GAP, round(1.6 * _TEXT)
-    heights = [round(_PANEL * image.shape[0] / image.shape[1]) for image in (row["photograph"] for row in rows)]
-    width = 2 * _MARGIN + len(names) * step - _GAP
-    map_height = (width - 2 * _MARGIN) * 3 // 10
-    top = _MARGIN + 4 * line
-    below = top + sum(heights) + len(rows) * _GAP + _MARGIN
-    sheet = Image.new("RGB", (width, below + line + map_height + _MARGIN), "white")
-    draw = ImageDraw.Draw(sheet)
-    small, large = ImageFont.load_default(_TEXT), ImageFont.load_default(1.5 * _TEXT)
-
-    draw.text((_MARGIN, _MARGIN), title, _INK, large)
-    for k, name in enumerate(names):
-        draw.text((_MARGIN + k * step + _PANEL / 2, top - line / 2), name, _INK, small, anchor="mm")
-    y = top
-    for row, height in zip(rows, heights):
-        for k, name in enumerate(names):
-            if name in row:
-                _paste(sheet, row[name], (_MARGIN + k * step, y), (_PANEL, height))
-        y += height + _GAP
-    draw.text((_MARGIN, below + line / 2), "environment", _INK, small, anchor="lm")
-    _paste(sheet, tone_map(environment), (_MARGIN, below + line), (2 * map_height, map_height))
-    for k, text in enumerate(lines):
-        draw.text((2 * map_height + 3 * _MARGIN, below + line + 1.5 * k * line), text, _INK, large)
-    with atomic_file(path) as stream:
-        sheet.save(stream, "PNG")
-
-
-def _paste(sheet, image, corner, size):
-    sheet.paste(Image.fromarray(to_8bit(image)).resize(size, Image.LANCZOS), corner)
+    line = 2 * _TEXT
+    map_height = (len(names) * (_PANEL + _GAP) - _GAP) * 3 // 10
+    panels = [[row.get(name) for name in names] for row in rows]
+    sheet = Sheet(panels, _PANEL, _GAP, _MARGIN, names, title, _TEXT, below=line + map_height + _MARGIN)
+    top = sheet.height - map_height - _MARGIN
+    sheet.text(_MARGIN, top - line, "environment", _TEXT)
+    sheet.image(tone_map(environment), _MARGIN, top, 2 * map_height, map_height)
+    sheet.text(2 * map_height + 3 * _MARGIN, top, "\n".join(lines), 1.5 * _TEXT)
+    sheet.write(path)

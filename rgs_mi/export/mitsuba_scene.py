@@ -20,12 +20,12 @@ from ..surfels.surfels import Surfels
 SURFELS, ENVIRONMENT, SHADER, SCENE = "object.ply", "environment.exr", "shader.npz", "scene.xml"
 
 
-def export(folder, scene, surfels, environment, shading, indirect, shader, views, spp=1) -> list[Path]:
+def export(folder, scene, surfels, environment, shading, shader, views, spp=1) -> list[Path]:
     """Write ``object.ply``, ``environment.exr``, ``shader.npz`` (where ``shader`` is not None, the identity) and
     ``scene.xml`` into ``folder`` and return their paths.
 
     The scene is the one that was fitted (a `FitScene`) with the results in place of where the fit started, its
-    ``shading``, ``indirect`` light, and a sensor of ``spp`` samples per pixel for each of ``views``, whose id is the view's
+    ``shading``, and a sensor of ``spp`` samples per pixel for each of ``views``, whose id is the view's
     name: ``mi.render(mi.load_file("scene.xml"), sensor=i)``.
     Raises: UserError where the disk is full or the folder can't be written.
     """
@@ -41,7 +41,7 @@ def export(folder, scene, surfels, environment, shading, indirect, shader, views
         {
             "specular": shading.specular,
             "diffuse": shading.diffuse,
-            "indirect": indirect,
+            "indirect": shading.indirect,
             "shader": SHADER if shader else None,
             "box": shading.box,
         },

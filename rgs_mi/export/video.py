@@ -10,6 +10,7 @@ from PIL import Image
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
+from ..core.sheet import Sheet
 
 VIDEO, SHEET = "video.mp4", "sheet.png"
 _SECONDS, _RATES = 6, (4, 30)  # about how long a video is, as far as these bounds of its frames a second let it
@@ -42,8 +43,7 @@ def write(folder, files) -> list[Path]:
     paths = [Path(folder) / VIDEO, Path(folder) / SHEET]
     _encode(paths[0], (_even(over_white(file)) for file in files), rate)
     chosen = sorted({int(k) for k in np.linspace(0, len(files) - 1, _CELLS).round()})
-    with atomic_file(paths[1]) as stream:
-        sheet([over_white(files[k]) for k in chosen]).save(stream, "PNG")
+    sheet([over_white(files[k]) for k in chosen]).write(paths[1])
     return paths
 
 
@@ -52,20 +52,12 @@ def over_white(file) -> np.ndarray:
     with Image.open(file) as image:
         pixels = np.asarray(image.convert("RGBA"), np.float32)
     alpha = pixels[..., 3:] / 255
-    return np.uint8(pixels[..., :3] * alpha + 255 * (1 - alpha) + 0.5)
+    return (pixels[..., :3] * alpha + 255 * (1 - alpha) + 0.5).astype(np.uint8)
 
 
-def sheet(frames) -> Image.Image:
-    """``frames``, [H, W, 3] uint8 each, row by row on white."""
-    height, width = frames[0].shape[:2]
-    cell = _WIDTH, max(1, round(_WIDTH * height / width))
-    columns = min(_COLUMNS, len(frames))
-    rows = -(-len(frames) // columns)
-    canvas = Image.new("RGB", (columns * (cell[0] + _GAP) + _GAP, rows * (cell[1] + _GAP) + _GAP), "white")
-    for k, frame in enumerate(frames):
-        corner = [_GAP + index * (size + _GAP) for index, size in zip((k % columns, k // columns), cell)]
-        canvas.paste(Image.fromarray(frame).resize(cell, Image.LANCZOS), corner)
-    return canvas
+def sheet(frames) -> Sheet:
+    """``frames``, [H, W, 3] uint8 each, row by row."""
+    return Sheet([frames[k : k + _COLUMNS] for k in range(0, len(frames), _COLUMNS)], _WIDTH, _GAP, margin=_GAP)
 
 
 def _even(frame):
@@ -85,7 +77,7 @@ def _encode(path, frames, rate):
             first.shape[1::-1],
             fps=rate,
             codec="libx264",
-            quality=None,
+            quality=None,  # pyright: ignore[reportArgumentType]  # the rate factor below stands for it
             macro_block_size=1,
             output_params=[*_COLORS, *_QUALITY],
         )

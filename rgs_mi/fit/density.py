@@ -4,8 +4,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.bounding_box import BoundingBox
+from ..core.camera import Camera
+from ..settings.settings import Density
 from ..surfels.surfels import Surfels
-from .model import logit
+from .model import Model, logit
+from .reflection_guided import boxes, guided
 
 _SPLIT_SCALE = 1.6  # a split surfel's halves are that much smaller (3DGS)
 
@@ -13,10 +17,10 @@ _SPLIT_SCALE = 1.6  # a split surfel's halves are that much smaller (3DGS)
 class Gradients:
     """Running mean of the image-plane gradient of each surfel's centre, over the views that saw it."""
 
-    def __init__(self, n: int):
+    def __init__(self, n: int) -> None:
         self.sum, self.count = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)
 
-    def add(self, gradient, seen, size):
+    def add(self, gradient: "mi.Vector2f", seen: "mi.Bool", size: tuple[int, int]) -> None:
         """``gradient``: of the loss with respect to the projected centres in pixels, ``mi.Vector2f``; ``seen``: which
         surfels the view of ``size`` (width, height) listed. Kept in NDC units, as 3DGS measures it."""
         ndc = mi.Vector2f(gradient.x * (size[0] / 2), gradient.y * (size[1] / 2))
@@ -29,7 +33,50 @@ class Gradients:
         return self.sum.numpy() / np.maximum(self.count.numpy(), 1)
 
 
-def densify(model, gradients: Gradients, extent: float | np.ndarray, settings, rng, budget: int, guided=None) -> None:
+class DensityControl:
+    """Density control of a fit under ``settings``: its statistics, and where views saw something reflective.
+
+    ``extent``: radius of the object in world units; ``box``: around the object where there are surroundings, else None.
+    """
+
+    def __init__(self, settings: Density, extent: float, box: BoundingBox | None, n: int) -> None:
+        self.settings, self.extent, self.box = settings, extent, box
+        self.gradients = Gradients(n)
+        self.reflective: dict[int, tuple[Camera, np.ndarray]] = {}  # by view: its camera, and boxes of what is reflective
+
+    def note_reflective(self, view: int, camera: Camera, mask: np.ndarray) -> None:
+        """Remember what is reflective in a view, where it guides density control; ``mask``: its β̂, [H, W] bool."""
+        if self.settings.guided:
+            self.reflective[view] = camera, boxes(mask)
+
+    def guided(self, model: Model) -> np.ndarray | None:
+        """[N] which surfels get half the threshold (RGS, Algorithm 1); None where nothing guides."""
+        if not self.reflective:
+            return None
+        return guided(model.numpy("centers"), *zip(*self.reflective.values()))
+
+    def refine(self, model: Model, rng: np.random.Generator, budget: int | None) -> None:
+        """End a round of statistics: `densify`, unless ``budget`` is None, and begin the next."""
+        if budget is not None:
+            densify(model, self.gradients, self._extents(model), self.settings, rng, budget, self.guided(model))
+        self.gradients = Gradients(len(model))
+
+    def _extents(self, model):
+        """What is large for a surfel: the object, or the distance from it in the surroundings."""
+        if self.box is None:
+            return self.extent
+        return np.maximum(self.extent, np.linalg.norm(model.numpy("centers") - self.box.center, axis=1))
+
+
+def densify(
+    model: Model,
+    gradients: Gradients,
+    extent: float | np.ndarray,
+    settings: Density,
+    rng: np.random.Generator,
+    budget: int,
+    guided: np.ndarray | None = None,
+) -> None:
     """One round of density control, in place. ``extent``: radius of the object in world units, or [N] what is large for each
     surfel; ``settings``: `Density`.
 

@@ -1,4 +1,4 @@
-"""The rows of `curves.Curves` as TensorBoard's event files, RUN/tensorboard: `scripts/optimize.py --tensorboard`."""
+"""The rows of `curves.Curves` as TensorBoard's event files, RUN/tensorboard: `rgs-mi optimize --tensorboard`."""
 
 import time
 import warnings

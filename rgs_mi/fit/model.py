@@ -195,8 +195,7 @@ class Model:
     def from_state(cls, arrays: dict) -> "Model":
         """The model that wrote ``state()``."""
         names = [name for name in (*SURFEL_PARAMETERS, ENVIRONMENT, SHADER) if name in arrays]
-        flat = {"curvature": np.zeros((len(arrays["centers"]), 3))}  # as in checkpoints of version 0.1.0
-        model = cls(flat | {name: arrays[name] for name in names}, arrays["rotation"], arrays["two_sided"])
+        model = cls({name: arrays[name] for name in names}, arrays["rotation"], arrays["two_sided"])
         for name in names:
             model._set_moments(name, mi.UInt32(int(arrays[f"{name}.t"])), *(as_float(arrays[f"{name}.{k}"]) for k in "mv"))
         return model

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ..core.camera import Camera
 from ..core.errors import UserError
+from ..core.runtime import cache_folder
 from ..core.scene_files import load_scene
 from ..datasets import load_dataset
 from ..datasets.path_traced import render_dataset
@@ -16,7 +17,6 @@ from ..settings.settings import Settings
 from ..shading.deferred import Shading
 from ..shading.environment import Environment
 
-RENDERED = Path("data")  # photographs of path-traced scenes are kept here, below the current folder
 _ENVIRONMENTS = ("envmap", "procedural_envmap", "constant")
 
 
@@ -104,5 +104,5 @@ class FitScene:
         """The photographs; those of a scene are path-traced on first use, which takes minutes."""
         folder = self.photographs
         if folder.suffix == ".xml":
-            folder = render_dataset(folder, RENDERED / folder.stem, quiet=quiet)
+            folder = render_dataset(folder, cache_folder(folder.stem), quiet=quiet)
         return load_dataset(folder)

@@ -10,14 +10,13 @@ none
 import hashlib
 import inspect
 import json
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from ..core.caches import cached_arrays
 from ..core.errors import UserError
-from ..core.files import atomic_file
 from ..datasets.types import DepthPrior, View
 from . import files, hull, stereo, vggt
 
@@ -79,11 +78,8 @@ def depth_priors(
     if cache is None or name == "files":
         return _PRIORS[name](views, **options)
     path = Path(cache) / f"{name}-{_key(name, views, options)[:24]}.npz"
-    priors = _load(path, views)
-    if priors is None:
-        priors = _PRIORS[name](views, **options)
-        _save(path, priors)
-    return priors
+    compute = lambda: _arrays(_PRIORS[name](views, **options))
+    return _priors(cached_arrays(path, lambda arrays: _check(arrays, views), compute))
 
 
 # ---- The cache ----
@@ -103,35 +99,29 @@ def _key(name, views, options) -> str:
     return digest.hexdigest()
 
 
-def _load(path, views) -> list[DepthPrior] | None:
-    """The priors of ``views`` in a file; None where it is missing or, with a warning, damaged."""
-    if not path.is_file():
-        return None
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            priors = [
-                DepthPrior(arrays[f"values_{i}"], bool(arrays["inverse"][i]), arrays.get(f"confidence_{i}"))
-                for i in range(len(views))
-            ]
-        for prior, view in zip(priors, views):
-            for array in (prior.values, prior.confidence):
-                if array is not None and (array.shape != view.pixels.shape[:2] or array.dtype != np.float32):
-                    raise ValueError("a map has the wrong shape")
-        return priors
-    except Exception as error:  # a damaged zip fails in a dozen ways, and each means the same here
-        warnings.warn(f"{path} is damaged ({error}): estimating the prior again", stacklevel=3)
-        return None
+def _check(arrays, views):
+    """Raises: ValueError or KeyError where these are not the `_arrays` of priors of ``views``."""
+    for i, view in enumerate(views):
+        for array in (arrays[f"values_{i}"], arrays.get(f"confidence_{i}")):
+            if array is not None and (array.shape != view.pixels.shape[:2] or array.dtype != np.float32):
+                raise ValueError("a map has the wrong shape")
+    if arrays["inverse"].shape != (len(views),):
+        raise ValueError("another number of maps")
 
 
-def _save(path, priors):
-    """Write ``priors`` whole or not at all. A disk that takes no more costs the cache, not the result."""
+def _arrays(priors) -> dict[str, np.ndarray]:
+    """What is kept of ``priors``."""
     arrays = {"inverse": np.array([prior.inverse for prior in priors])}
     for i, prior in enumerate(priors):
         arrays[f"values_{i}"] = prior.values
         if prior.confidence is not None:
             arrays[f"confidence_{i}"] = prior.confidence
-    try:
-        with atomic_file(path) as stream:
-            np.savez_compressed(stream, **arrays)
-    except UserError as error:
-        warnings.warn(str(error), stacklevel=3)
+    return arrays
+
+
+def _priors(arrays) -> list[DepthPrior]:
+    """The priors that `_arrays` were made of."""
+    return [
+        DepthPrior(arrays[f"values_{i}"], bool(inverse), arrays.get(f"confidence_{i}"))
+        for i, inverse in enumerate(arrays["inverse"])
+    ]

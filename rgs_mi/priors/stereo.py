@@ -18,6 +18,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy import ndimage
+from skimage.transform import downscale_local_mean
 
 from ..core.arrays import as_float
 from ..core.camera import Camera, opaque, pixel_rays
@@ -76,7 +77,7 @@ class SmallImage:
         pixels = view.pixels / np.float32(255) if view.pixels.dtype == np.uint8 else view.pixels
         grey = np.clip(pixels[..., :3], 0, 1).mean(-1) * pixels[..., 3] + 1 - pixels[..., 3]
         w, h = width // factor, height // factor
-        grey = grey[: h * factor, : w * factor].reshape(h, factor, w, factor).mean((1, 3))
+        grey = downscale_local_mean(grey[: h * factor, : w * factor], (factor, factor))
         camera = view.camera.cropped(0, 0, w * factor, h * factor).resized(w, h)
         return cls(camera, np.ascontiguousarray(grey, np.float32))
 

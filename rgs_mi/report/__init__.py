@@ -1,4 +1,4 @@
-"""report.html: what a run, or a suite of runs, came to, on one page that opens from disk, without network."""
+"""What a run, or a suite of runs, came to: pages that open from disk, without network, tables and pictures."""
 
 from .run import REPORT, write
 from .suite import write_suite

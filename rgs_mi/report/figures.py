@@ -1,43 +1,62 @@
-"""Figures of metrics.json in words; the page keeps the numbers beside them: <data data-figure='psnr' value='30.868030'>."""
+"""The figures of metrics.json in words: one label, one precision and one unit for each, wherever it is printed.
 
-from html import escape
+An angle's sign stands at every value; other units stand at the column's head, or at the value where it is asked for.
+"""
 
-from .html import Html
+from dataclasses import dataclass
 
-#: name in metrics.json -> label, words of a value, unit
+
+@dataclass(frozen=True)
+class Figure:
+    """``digits`` after the decimal point, ``paper_digits`` so many in the tables of the paper; ``scale``: what a value is
+    multiplied by to be in ``unit``."""
+
+    label: str
+    digits: int
+    paper_digits: int
+    unit: str = ""
+    scale: float = 1.0
+
+
+#: Name in metrics.json -> how it is written.
 FIGURES = {
-    "psnr": ("PSNR", "{:.2f}", " dB"),
-    "ssim": ("SSIM", "{:.4f}", ""),
-    "lpips": ("LPIPS (VGG)", "{:.4f}", ""),
-    "lpips_alex": ("LPIPS (AlexNet)", "{:.4f}", ""),
-    "normal_mae_deg": ("normal error", "{:.2f}", "°"),
-    "normal_ssim": ("SSIM of normals", "{:.4f}", ""),
-    "normal_lpips": ("LPIPS of normals", "{:.4f}", ""),
-    "surfels": ("surfels", "{:,.0f}", ""),
-    "render_fps": ("FPS", "{:.1f}", ""),
-    "train_seconds": ("time", "{}", ""),
-    "iterations": ("steps", "{:,.0f}", ""),
-    "peak_rss_mb": ("memory", "{:,.0f}", " MB"),
+    "psnr": Figure("PSNR", 2, 2, "dB"),
+    "ssim": Figure("SSIM", 4, 3),
+    "lpips": Figure("LPIPS", 4, 3),
+    "lpips_alex": Figure("LPIPS (AlexNet)", 4, 3),
+    "normal_mae_deg": Figure("normal error", 2, 2, "°"),
+    "normal_ssim": Figure("SSIM of normals", 4, 3),
+    "normal_lpips": Figure("LPIPS of normals", 4, 3),
+    "surfels": Figure("surfels", 0, 0),
+    "render_fps": Figure("FPS", 1, 0),
+    "train_seconds": Figure("time", 1, 0, "min", 1 / 60),
+    "iterations": Figure("steps", 0, 0),
+    "peak_rss_mb": Figure("memory", 0, 0, "MB"),
 }
 
 
-def cell(name: str, value, key: str | None = None, unit: bool = False) -> Html:
-    """The ``value`` of figure ``name``, a dash where it is None; ``key``: what it is called in metrics.json, where that is
-    not its name. ``unit``: with it."""
+def text(name: str, value, *, unit: bool = False, signed: bool = False, paper: bool = False) -> str:
+    """The ``value`` of the figure ``name``, '' for None; with its ``unit``; with its sign where it is a difference
+    (``signed``); as precisely as the ``paper`` writes it."""
     if value is None:
-        return Html("<span class='soft'>–</span>")
-    _, form, unit_words = FIGURES[name]
-    words = form.format(_clock(value) if name == "train_seconds" else value).replace(",", " ")
-    words += unit_words if unit else ""
-    return Html(f"<data data-figure='{escape(key or name, quote=True)}' value='{value!r}'>{words}</data>")
+        return ""
+    figure = FIGURES[name]
+    digits = figure.paper_digits if paper else figure.digits
+    words = f"{figure.scale * value:{'+' * signed},.{digits}f}".replace(",", " ")
+    return words + (figure.unit if figure.unit == "°" else f" {figure.unit}" if unit and figure.unit else "")
 
 
 def label(name: str) -> str:
-    """The head of a column."""
-    words, _, unit = FIGURES[name]
-    return f"{words},{unit}" if unit.strip() and unit != "°" else f"{words}{unit and ', °'}"
+    """What the figure ``name`` is called where its value stands beside it."""
+    return FIGURES[name].label
 
 
-def _clock(seconds):
-    minutes, seconds = divmod(round(seconds), 60)
-    return f"{minutes}:{seconds:02} min"
+def heading(name: str) -> str:
+    """The head of a column of the figure ``name``: its label and its unit, as far as values do not have it."""
+    figure = FIGURES[name]
+    return f"{figure.label}, {figure.unit}" if figure.unit not in ("", "°") else figure.label
+
+
+def number(value: float) -> str:
+    """A number that is none of `FIGURES`: four digits, or whole thousands."""
+    return f"{value:,.0f}".replace(",", " ") if abs(value) >= 1000 else f"{value:.4g}"

@@ -3,7 +3,6 @@
 import json
 import os
 import platform
-import resource
 import shlex
 import sys
 
@@ -14,12 +13,15 @@ import numpy as np
 from .. import __version__, report
 from ..core.files import atomic_file
 from ..core.progress import Progress
+from ..core.runtime import peak_rss_mb
 from ..evaluation import evaluate, lpips, pictures
 from ..export.mitsuba_scene import export
 from ..settings.config import to_dict
+from .figures import label, text
 
 METRICS, SHEET, GUIDED = "metrics.json", "contact_sheet.png", "guided.png"
 PREVIEWS = 4  # test views on the sheet and in the report, and with their G-buffers written
+_SUMMARY = ("psnr", "ssim", "lpips", "normal_mae_deg", "surfels", "iterations", "train_seconds", "render_fps")
 _NO_LPIPS = f"not measured, for want of weights: {lpips.INSTALL}"
 
 
@@ -37,7 +39,7 @@ def write(fit, scene, folder, quiet):
             scene,
             surfels,
             environment,
-            *fit.begun,
+            fit.shading,
             fit.model.shader(),
             evaluation_views(fit.dataset),
             fit.settings.spp,
@@ -121,7 +123,7 @@ def _facts(fit) -> dict:
         "iterations": fit.step_number,
         "surfels": len(fit.model),
         "parameters": sum(fit.model.numpy(name).size for name in fit.model.optimizer.keys()),
-        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_rss_mb": peak_rss_mb(),
         "train_views": len(fit.dataset.train),
         "test_views": len(fit.dataset.test),
         "photographs": str(fit.dataset.root.resolve()),
@@ -152,19 +154,5 @@ def circumstances() -> dict:
 
 def _summary(figures) -> list[str]:
     """The figures in words, a line each."""
-    minutes, seconds = divmod(round(figures["train_seconds"]), 60)
-    quality = []
-    if figures["psnr"] is None:
-        quality.append("no test views: nothing is held out to measure on")
-    else:
-        quality += [f"PSNR {figures['psnr']:.2f} dB", f"SSIM {figures['ssim']:.4f}"]
-    if figures["lpips"] is not None:
-        quality.append(f"LPIPS {figures['lpips']:.4f}")
-    if figures["normal_mae_deg"] is not None:
-        quality.append(f"normal error {figures['normal_mae_deg']:.2f}°")
-    return [
-        *quality,
-        f"{figures['surfels']:,} surfels".replace(",", " "),
-        f"{figures['iterations']} steps in {minutes}:{seconds:02} min",
-        f"{figures['render_fps']:.1f} FPS",
-    ]
+    lines = [f"{label(name)} {text(name, figures[name], unit=True)}" for name in _SUMMARY if figures[name] is not None]
+    return lines if figures["psnr"] is not None else ["no test views: nothing is held out to measure on", *lines]

@@ -3,7 +3,6 @@
 import json
 import math
 import os
-from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +11,8 @@ from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..datasets.images import read_image
 from . import html
-from .comparison import FIGURES
-from .figures import cell, label
 from .run import REPORT
+from .tables import FIGURES
 
 _STORED, _SHOWN = 224, 112  # pixels of a thumbnail's width
 
@@ -26,28 +24,26 @@ def write_suite(path, runs, title: str):
     Raises: UserError where the disk is full or the folder can't be written.
     """
     path = Path(path)
-    found = [(name, folder and Path(folder), *_figures(folder and Path(folder), error)) for name, folder, error in runs]
-    names = [name for name in FIGURES if any(figures.get(name) is not None for _, _, figures, _ in found)]
-    rows, bad, done = [], [], []
-    for k, (scene, folder, figures, error) in enumerate(found):
-        rows.append(
-            [
-                _scene(path, scene, folder, error),
-                html.Html("".join(_thumbnails(folder, scene))),
-                *(cell(name, figures.get(name), f"{scene}/{name}") for name in names),
-            ]
-        )
-        (bad.append(k) if error else done.append(figures))
-    mean = ["mean", f"{len(done)} of {len(found)}", *(_mean(name, done) for name in names)]
-    words = f"{len(done)} of {len(found)} scenes came to an end; figures of quality are of views that were held out."
+    rows = [_row(path, scene, folder and Path(folder), error) for scene, folder, error in runs]
+    names = [name for name in FIGURES if any(name in row["figures"] for row in rows)]
+    done = [row["figures"] for row in rows if not row["error"]]
+    means = {name: _mean([figures[name] for figures in done if name in figures]) for name in names}
+    page = html.render("suite.html", title=title, runs=rows, names=names, means=means, finished=len(done))
     with atomic_file(path) as stream:
-        stream.write(
-            html.page(
-                title,
-                html.paragraph(words, "soft"),
-                html.table(["scene", "photograph, rendering", *map(label, names)], rows, bad, mean),
-            ).encode()
-        )
+        stream.write(page)
+
+
+def _row(path, scene, folder, error) -> dict:
+    """What the page ``path`` shows of a run: its scene, its page where it has one, figures, pictures, and what is wrong."""
+    figures, error = _figures(folder, error)
+    page = folder / REPORT if folder and (folder / REPORT).exists() else None
+    return {
+        "scene": scene,
+        "page": page and Path(os.path.relpath(page, path.parent)).as_posix(),
+        "figures": figures,
+        "pictures": list(_thumbnails(folder, scene)),
+        "error": error,
+    }
 
 
 def _figures(folder, error):
@@ -63,20 +59,8 @@ def _figures(folder, error):
     return numbers, error or unfinished
 
 
-def _scene(path, scene, folder, error):
-    """The name, a link where the run has a page, and below it what went wrong."""
-    report = folder and folder / REPORT
-    words = (
-        html.link(scene, Path(os.path.relpath(report, path.parent)).as_posix())
-        if report and report.exists()
-        else escape(scene)
-    )
-    return html.Html(words + (f"<small>{escape(error)}</small>" if error else ""))
-
-
-def _mean(name, done):
-    values = [figures[name] for figures in done if figures.get(name) is not None]
-    return cell(name, float(np.mean(values)) if values else None, f"mean/{name}")
+def _mean(values):
+    return float(np.mean(values)) if values else None
 
 
 def _thumbnails(folder, scene):
@@ -89,4 +73,4 @@ def _thumbnails(folder, scene):
             continue  # what is missing in a row is seen
         width = max(pixels.shape[1] // 3, 1)
         for k, kind in enumerate(("photograph", "rendering")):
-            yield html.thumbnail(pixels[:, k * width : (k + 1) * width, :3], f"{kind} of {scene}", _STORED, _SHOWN)
+            yield html.jpeg(pixels[:, k * width : (k + 1) * width, :3], f"{kind} of {scene}", _STORED, _SHOWN)

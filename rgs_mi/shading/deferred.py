@@ -32,6 +32,7 @@ class Shading:
     samples: int = SAMPLES
     eta: float = DEFAULT_ETA
     box: BoundingBox | None = None
+    indirect: str = "none"
 
 
 @dataclass

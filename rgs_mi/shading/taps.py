@@ -7,7 +7,7 @@ term that rises within it moves it further. Taps stand for it: lookups with weig
 
 d_o the mirror direction, n the normal. At n·ω_o = 1, where the filter's kernels are the BSDF's lobe itself, d_k = d_o.
 (a, b, log w) are tabled against n·ω_o, roughness and φ, the part of what is reflected that Schlick's Fresnel term adds to a
-mirror of constant colour. ``taps.npy`` was fitted to `monte_carlo` under random environments by `scripts/fit_taps.py`.
+mirror of constant colour. ``taps.npy`` was fitted to `monte_carlo` under random environments by `rgs-mi fit-taps`.
 """
 
 import functools

@@ -8,6 +8,7 @@ fixed seeds.
 import functools
 
 import numpy as np
+from skimage.transform import downscale_local_mean
 
 from ..core.errors import UserError
 from .cafe import cafe
@@ -42,8 +43,8 @@ def environment(name: str, height: int = 512) -> np.ndarray:
     if height < 2:
         raise UserError(f"environment '{name}': resolution is {height}, needs at least 2")
     s = SUPERSAMPLING
-    fine = painter(directions(s * height, 2 * s * height).reshape(-1, 3))
-    return fine.reshape(height, s, 2 * height, s, 3).mean((1, 3)).astype(np.float32)
+    fine = painter(directions(s * height, 2 * s * height).reshape(-1, 3)).reshape(s * height, 2 * s * height, 3)
+    return downscale_local_mean(fine, (s, s, 1)).astype(np.float32)
 
 
 def constant(radiance: float, height: int) -> np.ndarray:

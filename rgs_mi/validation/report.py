@@ -1,12 +1,10 @@
-"""What `scripts/crossvalidate.py` calls.
+"""What `rgs-mi crossvalidate` calls.
 
 OUT/crossvalidation.html    everything on one page
 OUT/cases.csv               a row a case
 OUT/CASE.exr                float maps: path, monte_carlo, split_sum, z
 """
 
-import csv
-import io
 import itertools
 import sys
 
@@ -16,6 +14,8 @@ from ..core.color import tone_map
 from ..core.files import atomic_file, write_exr
 from ..core.progress import Progress
 from ..report import html
+from ..report.plots import curves
+from ..report.tables import csv_text
 from .cases import BOUNDS
 from .checks import checks
 
@@ -31,13 +31,9 @@ def crossvalidate(out, cases, validator, quiet=False, checked=(0.1, 0.3, 0.7)) -
             _write_maps(out / f"{case.name}.exr", results[-1])
             progress.update((k + 1) / len(cases), cases=k + 1)
     rows = [_row(r) for r in results]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    for name, content in (("cases.csv", text.getvalue()), ("crossvalidation.html", _html(results, rows, found))):
+    for name, content in {"cases.csv": csv_text(rows).encode(), "crossvalidation.html": _html(results, rows, found)}.items():
         with atomic_file(out / name) as stream:
-            stream.write(content.encode())
+            stream.write(content)
     failures = [f"{r.case.name}: {words}" for r in results for words in r.failures()]
     failures += [f"{c.name} is {c.value:.4g} (bound: {c.bound:g})" for c in found if not c.passed]
     for line in failures:
@@ -77,65 +73,42 @@ def _write_maps(path, r):
     )
 
 
-def _html(results, rows, found) -> str:
-    parts = [
-        html.paragraph(
-            "Mitsuba's path tracer (two segments: direct light) against rgs_deferred's estimators, on Mitsuba's geometry and "
-            "rays. z_passed: the part of all pixels whose difference to monte_carlo is within their standard errors; "
-            "z_of_sums: the difference of sums over all pixels in standard errors; split_sum_error: Σ|difference| / Σ truth, "
-            "of which noise is the truth's own; interreflection: what deeper paths add."
-        )
-    ]
-    sphere = [r for r in results if r.case.shape == "sphere"]
-    if sphere:
-        series = {}
-        for r in sphere:
-            series.setdefault(r.case.material, {}).setdefault(r.case.roughness, []).append(100 * r.error)
-        series = {name: (sorted(values), [np.mean(values[x]) for x in sorted(values)]) for name, values in series.items()}
-        parts += [
-            html.heading("Split-sum's error against roughness, sphere, mean over environments"),
-            html.curves(series, "roughness", "%", {kind: 100 * b for kind, b in BOUNDS.items()}),
-        ]
-    parts.append(html.heading("Cases"))
-    parts.append(
-        html.table(
-            list(rows[0]),
-            [list(row.values()) for row in rows],
-            [k for k, row in enumerate(rows) if row["verdict"] != "passes"],
-        )
+def _html(results, rows, found) -> bytes:
+    return html.render(
+        "crossvalidation.html",
+        title="Cross-validation with Mitsuba's path tracer",
+        plot=_plot([r for r in results if r.case.shape == "sphere"]),
+        columns=list(rows[0]),
+        cases=[list(row.values()) for row in rows],
+        bad_cases=[k for k, row in enumerate(rows) if row["verdict"] != "passes"],
+        over_bound=any(r.case.shape == "sphere" and r.error > BOUNDS[r.case.kind] for r in results),
+        checks=[(c.name, f"{c.value:.4g}", f"{c.bound:g}") for c in found],
+        bad_checks=[k for k, c in enumerate(found) if not c.passed],
+        pictures=[_picture(*key, list(group)) for key, group in itertools.groupby(results, _what)],
     )
-    if any(r.case.shape == "sphere" and r.error > BOUNDS[r.case.kind] for r in results):
-        parts.append(
-            html.paragraph(
-                "Where split_sum is over its bound, what is left is its approximation: three lookups in a filtered environment "
-                "for a lobe that is stretched, and cut off at the horizon, before light with hard edges. Finer levels of the "
-                "filter do not lower it (docs/findings.md). monte_carlo has no such error."
-            )
-        )
-    parts.append(html.heading("Sampler, reciprocity, energy"))
-    parts.append(
-        html.table(
-            ("check", "value", "bound"),
-            [(c.name, f"{c.value:.4g}", f"{c.bound:g}") for c in found],
-            [k for k, c in enumerate(found) if not c.passed],
-        )
+
+
+def _plot(results) -> str | None:
+    """The error of `results` of one shape against roughness, means over environments, a curve a material."""
+    series = {}
+    for r in results:
+        series.setdefault(r.case.material, {}).setdefault(r.case.roughness, []).append(100 * r.error)
+    series = {name: (sorted(values), [np.mean(values[x]) for x in sorted(values)]) for name, values in series.items()}
+    return curves(series, "roughness", "%", {kind: 100 * b for kind, b in BOUNDS.items()}) if series else None
+
+
+def _what(r):
+    return r.case.shape, r.case.environment, r.case.material
+
+
+def _picture(shape, environment, material, group) -> html.Picture:
+    """Results that differ in roughness alone, side by side."""
+    values = ", ".join(f"{r.case.roughness:g}" for r in group)
+    words = (
+        f"{shape} in {environment}, {material}; roughness {values} from left to right. Rows: path, monte_carlo, split_sum; "
+        "z from −5 (blue) to 5 (red); split_sum − truth from −0.2 to 0.2"
     )
-    parts.append(html.heading("Pictures"))
-    key = lambda r: (r.case.shape, r.case.environment, r.case.material)
-    for (shape, environment, material), group in itertools.groupby(results, key):
-        group = list(group)
-        columns = [_column(r) for r in group]
-        values = ", ".join(f"{r.case.roughness:g}" for r in group)
-        parts.append(
-            html.figure(
-                np.concatenate(columns, 1),
-                f"{shape} in {environment}, {material}; roughness {values} "
-                "from left to right. Rows: path, monte_carlo, split_sum; z from −5 (blue) to 5 (red); "
-                "split_sum − truth from −0.2 to 0.2",
-                2,
-            )
-        )
-    return html.page("Cross-validation with Mitsuba's path tracer", *parts)
+    return html.png(np.concatenate([_column(r) for r in group], 1), words, zoom=2)
 
 
 def _column(r):

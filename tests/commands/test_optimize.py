@@ -40,7 +40,7 @@ def test_metrics(run):
     assert all(name in figures for name in SHOWN)
     assert (figures["lpips"] is None) == bool(figures["lpips_reason"])
     assert figures["psnr"] > 10 and figures["normal_mae_deg"] < 30
-    assert figures["settings"]["start"]["surfels"] == 300
+    assert figures["settings"]["initialization"]["surfels"] == 300
     assert list(figures["views"]) == ["r_0", "r_1", "r_2"]
     assert figures["psnr"] == pytest.approx(np.mean([v["psnr"] for v in figures["views"].values()]))
 

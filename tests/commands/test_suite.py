@@ -12,7 +12,7 @@ import pytest
 from rgs_mi.commands import jobs, suite
 from rgs_mi.core import subprocesses
 from rgs_mi.core.errors import UserError
-from rgs_mi.report import comparison, published, results
+from rgs_mi.report import paper_results, results, tables
 
 from captures import photographs, write_colmap, write_nerfstudio, write_nero
 from runs import PATIENCE, make_suite, start_script, wait_for
@@ -107,7 +107,7 @@ def test_goes_on(captures, tmp_path, inside, capsys):
     first = read(out)
     metrics = json.loads((out / "car" / "metrics.json").read_text())
     assert first["runs"][0]["scene"] == "car"
-    assert all(first["runs"][0][name] == metrics[name] for name in (*comparison.FIGURES, *comparison.DETAILS))
+    assert all(first["runs"][0][name] == metrics[name] for name in (*tables.FIGURES, *tables.DETAILS))
     assert (
         first["means"]["Shiny Blender"]["psnr"] == pytest.approx(sum(r["psnr"] for r in first["runs"]) / 2)
         and first["means"]["Shiny Blender"]["of"] == 6
@@ -204,17 +204,21 @@ def test_workers(monkeypatch):
 
 
 def test_data_sets_by_name():
-    assert published.by_data_set(["ball", "teapot", "helmet"]) == {"Shiny Blender": ["ball", "helmet", "teapot"]}
-    assert published.by_data_set(["cat_blender", "luyu", "teapot"])["Glossy Synthetic"] == ["cat_blender", "luyu", "teapot"]
-    assert published.by_data_set(["lego", "sedan", "bottle"]) == {"NeRF Synthetic": ["lego"], "Ref-NeRF Real": ["sedan"]}
-    assert published.by_data_set([]) == {}
+    assert paper_results.by_data_set(["ball", "teapot", "helmet"]) == {"Shiny Blender": ["ball", "helmet", "teapot"]}
+    assert paper_results.by_data_set(["cat_blender", "luyu", "teapot"])["Glossy Synthetic"] == [
+        "cat_blender",
+        "luyu",
+        "teapot",
+    ]
+    assert paper_results.by_data_set(["lego", "sedan", "bottle"]) == {"NeRF Synthetic": ["lego"], "Ref-NeRF Real": ["sedan"]}
+    assert paper_results.by_data_set([]) == {}
 
 
 def test_every_row_of_the_paper_fits_its_table():
-    for title, (data_sets, figures) in published.TABLES.items():
+    for title, (data_sets, figures) in paper_results.TABLES.items():
         assert all(
             len(rows) == len(data_sets) and all(len(row) == len(figures) for row in rows)
-            for rows in published.PAPER[title].values()
+            for rows in paper_results.PAPER[title].values()
         )
 
 
@@ -225,13 +229,13 @@ def row(scene, status="finished", **figures):
         "seed": 0,
         "status": status,
         "error": None,
-        **dict.fromkeys((*comparison.FIGURES, *comparison.DETAILS)),
+        **dict.fromkeys((*tables.FIGURES, *tables.DETAILS)),
         **figures,
     }
 
 
 def test_tables():
-    ours = published.means(
+    ours = paper_results.means(
         [
             row(
                 "ball",
@@ -251,7 +255,7 @@ def test_tables():
         ["ball", "car", "toaster", "lego", "bottle", "sedan"],
     )
     assert list(ours) == ["Shiny Blender", "NeRF Synthetic"] and ours["Shiny Blender"]["psnr"] == 31
-    sections = published.tables(ours)
+    sections = paper_results.tables(ours)
     assert [s for s in sections if s.startswith("## ")] == [
         "## Reflective objects",
         "## NeRF Synthetic",
@@ -259,7 +263,7 @@ def test_tables():
         "## Budget, Shiny Blender",
     ]
     lines = [[c.strip() for c in line.split("|")[1:-1]] for line in "\n".join(sections).splitlines() if "|" in line]
-    assert lines[0] == ["", "Shiny Blender: PSNR", "Shiny Blender: SSIM", "Shiny Blender: LPIPS"]
+    assert lines[0] == ["", "Shiny Blender: PSNR, dB", "Shiny Blender: SSIM", "Shiny Blender: LPIPS"]
     of = [line[1:] for line in lines if line[0] == "RGS, the paper"]
     assert of == [
         ["35.38", "0.976", "0.050"],
@@ -274,7 +278,7 @@ def test_tables():
         ["this run, scenes 2 of 6", "3.50°", "", ""],
         ["this run, scenes 2 of 6", "40 000", "10", "20", "900", "31.00"],
     ]
-    assert published.tables(published.means([row("bottle", psnr=1.0)], ["bottle"])) == []
+    assert paper_results.tables(paper_results.means([row("bottle", psnr=1.0)], ["bottle"])) == []
     lone = [row("teapot", psnr=30.0)]  # of the data set that the others of the suite are of
-    assert list(published.means(lone, ["teapot", "ball"])) == ["Shiny Blender"]
-    assert list(published.means(lone, ["teapot", "angel"])) == ["Glossy Synthetic"]
+    assert list(paper_results.means(lone, ["teapot", "ball"])) == ["Shiny Blender"]
+    assert list(paper_results.means(lone, ["teapot", "angel"])) == ["Glossy Synthetic"]

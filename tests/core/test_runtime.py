@@ -73,3 +73,21 @@ def test_one_core_reads_and_writes_exr_files(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "1.0", done.stderr
+
+
+def test_peak_memory_in_the_unit_of_the_system(monkeypatch):
+    resource = pytest.importorskip("resource")
+    usage = type("Usage", (), {"ru_maxrss": 512 << 10})
+    monkeypatch.setattr(resource, "getrusage", lambda who: usage)
+    for platform, expected in {"linux": 512.0, "darwin": 0.5}.items():
+        monkeypatch.setattr(sys, "platform", platform)
+        assert runtime.peak_rss_mb() == expected
+    monkeypatch.setitem(sys.modules, "resource", None)  # as on Windows
+    assert runtime.peak_rss_mb() is None
+
+
+def test_the_folder_of_caches_can_be_set(monkeypatch, tmp_path):
+    monkeypatch.delenv(runtime.CACHE_VARIABLE, raising=False)
+    assert runtime.cache_folder("priors").as_posix() == "data/priors"
+    monkeypatch.setenv(runtime.CACHE_VARIABLE, str(tmp_path))
+    assert runtime.cache_folder("priors") == tmp_path / "priors" and runtime.cache_folder() == tmp_path

@@ -223,7 +223,7 @@ def test_undistorted_photographs_are_kept(tmp_path, monkeypatch):
         for a, b in zip(first, views(load_dataset(tmp_path))):
             np.testing.assert_array_equal(a.pixels, b.pixels)
     kept[0].write_bytes(b"damaged")
-    with pytest.warns(UserWarning, match="is damaged .*undistorting the photograph again"):
+    with pytest.warns(UserWarning, match="is damaged .*computing it again"):
         for a, b in zip(first, views(load_dataset(tmp_path))):
             np.testing.assert_array_equal(a.pixels, b.pixels)
     write_colmap(tmp_path, photographs(k1=-0.2), "SIMPLE_RADIAL", (95, *PRINCIPAL, -0.19))

@@ -66,8 +66,15 @@ def test_transparent_is_white(frames):
     assert (video.over_white(frames[0])[0, 0] == 255).all() and (video.over_white(frames[0])[8, 5] == [255, 127, 127]).all()
 
 
-def test_sheet_of_a_few():
-    assert video.sheet([np.zeros((10, 20, 3), np.uint8)] * 3).size == (3 * 328 + 8, 160 + 16)
+def test_sheet_of_a_few(tmp_path):
+    """As wide as the frames want it, which lie where they belong to the pixel."""
+    frames = [np.full((10, 20, 3), 40 * k, np.uint8) for k in range(3)]
+    video.sheet(frames).write(tmp_path / "sheet.png")
+    sheet = np.asarray(Image.open(tmp_path / "sheet.png"))[..., :3]
+    assert sheet.shape == (160 + 16, 3 * 328 + 8, 3)
+    for k in range(3):
+        assert (sheet[8:-8, 8 + 328 * k : 328 * (k + 1)] == 40 * k).all()
+    assert (sheet[:8] == 255).all() and (sheet[:, 328:336] == 255).all()
 
 
 def test_no_encoder(frames, tmp_path, monkeypatch):

@@ -129,11 +129,3 @@ def test_state_round_trip():
         for a, b in zip(m.optimizer.state[name][3][:3], again.optimizer.state[name][3][:3]):
             assert np.array_equal(np.array(a).ravel(), np.array(b).ravel())
     assert not again.two_sided
-
-
-def test_states_of_before_curvature_are_flat():
-    m = model()
-    state = {name: value for name, value in m.state().items() if not name.startswith("curvature")}
-    old = Model.from_state(state)
-    assert old.numpy("curvature").shape == (N, 3) and not old.numpy("curvature").any()
-    assert (old.numpy("centers") == m.numpy("centers")).all()

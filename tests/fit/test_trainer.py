@@ -12,8 +12,7 @@ from rgs_mi.commands.optimize import start
 from rgs_mi.core.arrays import as_float
 from rgs_mi.datasets.photographs import Photographs
 from rgs_mi.datasets.types import DepthPrior
-from rgs_mi.fit import losses
-from rgs_mi.fit import trainer as fit_module
+from rgs_mi.fit import losses, schedule
 from rgs_mi.fit.density import Gradients
 from rgs_mi.fit.trainer import Fit
 from rgs_mi.settings.settings import Density, Initialization, LearningRates, Settings, Stage, Weights
@@ -175,10 +174,10 @@ def test_no_kernel_is_compiled_after_warm_up(dataset, indirect, diffuse, monkeyp
         for _ in range(4):
             fit.step()
         fit.model.select(np.arange(n), {})
-        fit.gradients, fit.proxies = Gradients(n), None
+        fit.density.gradients, fit.proxies = Gradients(n), None
     fit.step()
     fit.model.select(np.arange(250), {})
-    fit.gradients, fit.proxies = Gradients(250), None
+    fit.density.gradients, fit.proxies = Gradients(250), None
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         for _ in range(8):
@@ -222,11 +221,11 @@ def test_a_fit_that_is_stopped_is_shaded_by_what_has_begun(dataset):
     )
     fit, begun = Fit(dataset, model(), settings, 1.0, Shading("monte_carlo")), []
     for fit.step_number in (10, 30, 50, 70):
-        shading, indirect = fit.begun
-        begun.append((shading.specular, indirect))
+        shading = fit.shading
+        begun.append((shading.specular, shading.indirect))
         lighting = fit.lighting(fit.model.surfels(0))
         assert (lighting is None) == (shading.specular == "none")
-        assert (lighting is not None and lighting.indirect is not None) == (indirect != "none")
+        assert (lighting is not None and lighting.indirect is not None) == (shading.indirect != "none")
     assert begun == [("none", "none"), ("split_sum", "none"), ("split_sum", "one_bounce"), ("monte_carlo", "one_bounce")]
 
 
@@ -241,7 +240,7 @@ def test_normals_of_a_hull_wait_for_the_light(dataset, two_sided, normals_start,
     moved = {k: np.abs(learned.numpy(k) - value).max() for k, value in before.items()}
     assert moved["rotations"] == pytest.approx(part * 2e-3, rel=0.01) and moved["centers"] == pytest.approx(5e-4, rel=0.01)
     fit.step_number = 8  # of 40
-    fit._set_rates()
+    fit._follow_schedule()
     assert fit.model.optimizer.learning_rate("rotations") == pytest.approx(2e-3 * 0.1**0.2)
 
 
@@ -249,7 +248,7 @@ def test_normals_of_a_hull_wait_for_the_light(dataset, two_sided, normals_start,
 def test_rates_fall_to_zero_in_the_end(dataset, cooldown, parts):
     fit = Fit(dataset, model(), replace(SETTINGS, cooldown=cooldown), 1.0)
     for fit.step_number, part in zip((20, 30, 35, 39), parts):
-        fit._set_rates()
+        fit._follow_schedule()
         for name, (first, last) in (("centers", (5e-4, 1e-5)), ("log_environment", (6e-2, 5e-3))):
             rate = first * (last / first) ** (fit.step_number / 40)
             assert fit.model.optimizer.learning_rate(name) == pytest.approx(part * rate)
@@ -268,7 +267,7 @@ def test_a_light_that_is_given_keeps_its_rows(dataset):
 )
 def test_environment_gets_the_rows_that_photographs_tell_apart(dataset, monkeypatch, refine_start, downscale, most, rows):
     """A mirror ball whose radius is 3/8 of 83 pixels has 49 of them from pole to pole (π r/2)."""
-    monkeypatch.setattr(fit_module, "_MOST_ROWS", most)
+    monkeypatch.setattr(schedule, "_MOST_ROWS", most)
     settings = replace(SETTINGS, refine_start=refine_start, stages=(Stage(1.0, downscale, 1),), indirect="none")
     fit = Fit(dataset, model(), settings, 1.0, Shading("split_sum"))
     fit.step_number = 19  # of 40

@@ -10,6 +10,7 @@ from PIL import Image
 
 from rgs_mi.core.camera import Camera
 from rgs_mi.core.errors import UserError
+from rgs_mi.datasets.images import resize
 from rgs_mi.datasets.types import DepthPrior, View
 from rgs_mi.priors import NAMES, depth_priors, hull, maps, vggt
 
@@ -92,7 +93,7 @@ def test_resize_keeps_planes_and_borders(shape):
         x, y = np.meshgrid((np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height)
         return 2 + x - 3 * y
 
-    out = maps.resize(plane(*shape), 40, 48)
+    out = resize(plane(*shape), 40, 48)
     assert out.shape == (40, 48) and out.dtype == np.float32
     if shape != (1, 1):
         edge = np.ceil(0.5 * 40 / shape[0]).astype(int) + 1
@@ -103,7 +104,7 @@ def test_resize_keeps_planes_and_borders(shape):
 def test_resize_does_not_spread_the_unknown():
     values = np.full((10, 10), 3.0)
     values[:, 5:] = np.nan
-    out = maps.resize(values, 40, 40)
+    out = resize(values, 40, 40)
     assert np.all(out[:, :20] == 3) and np.isnan(out[:, 20:]).all()
 
 

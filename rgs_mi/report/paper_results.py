@@ -4,7 +4,8 @@ A scene is told by its name, and with it the data set that it belongs to. Figure
 paper calls parameters are surfels.
 """
 
-from .comparison import DETAILS, FIGURES, mean, text_table
+from .figures import heading, text
+from .tables import DETAILS, FIGURES, mean, text_table
 
 #: The scenes of the data sets that the paper has figures of.
 SCENES = {
@@ -65,20 +66,6 @@ PAPER = {
     },
 }
 
-# As the paper writes them: figure -> words, number
-_STYLE = {
-    "psnr": ("PSNR", "{:.2f}"),
-    "ssim": ("SSIM", "{:.3f}"),
-    "lpips": ("LPIPS", "{:.3f}"),
-    "normal_mae_deg": ("error of normals", "{:.2f}°"),
-    "normal_ssim": ("SSIM", "{:.3f}"),
-    "normal_lpips": ("LPIPS", "{:.3f}"),
-    "surfels": ("surfels", "{:,.0f}"),
-    "render_fps": ("FPS", "{:.0f}"),
-    "train_seconds": ("min", "{:.0f}"),
-    "peak_rss_mb": ("MB", "{:.0f}"),
-}
-
 
 def by_data_set(names) -> dict[str, list[str]]:
     """Data set -> those of ``names`` that are scenes of it; what two have goes where more of the others belong."""
@@ -92,7 +79,7 @@ def by_data_set(names) -> dict[str, list[str]]:
 
 
 def means(rows, names) -> dict[str, dict]:
-    """For each data set that finished ``rows`` (see `comparison`) are of: the means over its scenes, and how many these
+    """For each data set that finished ``rows`` (see `tables`) are of: the means over its scenes, and how many these
     ``scenes`` are, ``of`` how many. ``names``: all scenes of the suite, which tell its data sets."""
     table = {}
     for data_set, scenes in by_data_set(names).items():
@@ -114,19 +101,16 @@ def tables(ours: dict[str, dict]) -> list[str]:
         if not shown:
             continue
         prefix = lambda k: f"{data_sets[k]}: " if len(data_sets) > 1 else ""
-        lines = [("", *(f"{prefix(k)}{_STYLE[name][0]}" for k in shown for name in figures))]
+        lines = [("", *(f"{prefix(k)}{heading(name)}" for k in shown for name in figures))]
         for method, numbers in PAPER[title].items():
-            lines.append((method, *(_cell(name, n) for k in shown for name, n in zip(figures, numbers[k]))))
+            lines.append((method, *(text(name, n, paper=True) for k in shown for name, n in zip(figures, numbers[k]))))
         counts = ", ".join(f"{ours[data_sets[k]]['scenes']} of {ours[data_sets[k]]['of']}" for k in shown)
         lines.append(
-            (f"this run, scenes {counts}", *(_cell(name, ours[data_sets[k]][name]) for k in shown for name in figures))
+            (
+                f"this run, scenes {counts}",
+                *(text(name, ours[data_sets[k]][name], paper=True) for k in shown for name in figures),
+            )
         )
-        heading = title if len(data_sets) > 1 or title == data_sets[0] else f"{title}, {data_sets[0]}"
-        sections += [f"## {heading}", text_table(lines)]
+        section = title if len(data_sets) > 1 or title == data_sets[0] else f"{title}, {data_sets[0]}"
+        sections += [f"## {section}", text_table(lines)]
     return sections
-
-
-def _cell(name, value):
-    if value is None:
-        return ""
-    return _STYLE[name][1].format(value / 60 if name == "train_seconds" else value).replace(",", " ")

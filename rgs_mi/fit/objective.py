@@ -1,0 +1,93 @@
+"""The objective of a fit: what a rendered view costs, term by term (docs/method.md §4)."""
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.bounding_box import BoundingBox
+from ..datasets.photographs import Photograph
+from ..settings.settings import Settings
+from ..shading import deferred
+from . import losses
+from .reflection_guided import reflective_mask
+
+
+@dataclass
+class ViewLoss:
+    """The losses of a view: ``terms``, weighted, by the names that curves have for them, ``mi.Float`` of width 1 each; the
+    mean squared ``error`` in display values; ``reflective`` [H, W] bool, β̂ of the view, None where nothing asks for it."""
+
+    terms: "dict[str, mi.Float]"
+    error: "mi.Float"
+    reflective: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The losses of views under ``settings``; ``extent``: radius of the object in world units; ``box``: where the scene
+    reflects (None: everywhere)."""
+
+    settings: Settings
+    extent: float
+    box: BoundingBox | None = None
+
+    @property
+    def full(self) -> bool:
+        """Whether a loss wants the maps that only regularizers read (see `render_gbuffer`)."""
+        w = self.settings.weights
+        return max(w.distortion, w.delta_normal) > 0
+
+    def __call__(self, image: deferred.Image, photo: Photograph, masked: bool, consistency: float, step: int) -> ViewLoss:
+        """The losses of ``image``, a view of ``photo``, which has a mask where ``masked``.
+
+        ``consistency``: the weight of depth-normal consistency by now; ``step`` decides which quarter of the pixels
+        minimum variation looks at.
+        """
+        w, maps, size = self.settings.weights, image.gbuffer.all, photo.camera.size
+        rendered = losses.display(image.color, maps.alpha, self.settings.background)
+        terms = {"photometric": losses.photometric(rendered, photo.color, size, w.dssim)}
+        if w.mask > 0 and masked:
+            terms["mask"] = w.mask * losses.mask(maps.alpha, photo.alpha)
+        if w.delta_normal > 0:
+            terms["delta_normal"] = w.delta_normal * losses.delta_normal(image.gbuffer)
+        if w.distortion > 0:
+            terms["distortion"] = w.distortion * losses.distortion(maps, self.extent)
+        weight = dr.opaque(mi.Float, consistency)
+        terms["consistency"] = weight * losses.depth_normal_consistency(image.gbuffer, photo.camera)
+        part_of_image = size[0] * size[1] / (photo.size[0] * photo.size[1])  # these are means over the whole photograph
+        terms = {name: part_of_image * term for name, term in terms.items()}
+        error = dr.mean(dr.mean(dr.square(dr.detach(rendered) - photo.color))) * part_of_image
+        regional, reflective = self._regional(image.gbuffer, photo, step)
+        return ViewLoss({f"loss.{name}": term for name, term in (terms | regional).items()}, error, reflective)
+
+    def _regional(self, gbuffer, photo, step):
+        """Losses that are normalized by regions of their own: RGS's L_normal and L_depth, and minimum variation; and β̂."""
+        w, maps, terms, mask = self.settings.weights, gbuffer.all, {}, None
+        if max(w.normal, w.minimum_variation) > 0 or self.settings.density.guided:
+            mask = self.reflective_mask(gbuffer, photo.camera)
+            if w.normal > 0:
+                terms["normal"] = w.normal * losses.normal_smoothness(gbuffer, mask, w.crease)
+            if w.minimum_variation > 0:
+                corner = divmod(step % 4, 2)
+                terms["minimum_variation"] = w.minimum_variation * losses.minimum_variation(gbuffer, mask, corner)
+        if w.depth > 0 and photo.prior is not None:
+            covered = maps.alpha > 0.5
+            depth = maps.depth / dr.select(covered, maps.alpha, 1)
+            terms["depth"] = w.depth * losses.pearson_depth(depth, photo.prior, covered, photo.inverse)
+        return terms, mask
+
+    def reflective_mask(self, gbuffer, camera) -> np.ndarray:
+        """β̂ of a view, [H, W] bool."""
+        width, height = gbuffer.size
+        alpha = dr.select(deferred.within(gbuffer, camera, self.box), gbuffer.all.alpha, 0)
+        roughness, alpha = (dr.detach(v).numpy().reshape(height, width) for v in (gbuffer.all.roughness, alpha))
+        return reflective_mask(roughness / np.maximum(alpha, 1e-6), alpha, self.settings.reflective)
+
+    def environment(self, log_radiance: "mi.TensorXf") -> "mi.Float | None":
+        """Weighted total variation of the environment, ``log_radiance`` [H, 2 H, 3]; None where it has no weight."""
+        weight = self.settings.weights.environment_tv
+        if weight == 0:
+            return None
+        return dr.opaque(mi.Float, weight) * losses.environment_total_variation(log_radiance)

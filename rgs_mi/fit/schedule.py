@@ -1,0 +1,119 @@
+"""What a fit does when: functions of `Settings` and of progress, the spent part of the budget in [0, 1]."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..settings.settings import Settings, Stage
+from ..shading.deferred import Shading
+from .model import ENVIRONMENT, SHADER
+
+#: The field of `LearningRates` that each parameter of a `Model` obeys.
+_RATES = {
+    "centers": "centers",
+    "rotations": "rotations",
+    "log_scales": "scales",
+    "logit_opacities": "opacities",
+    "sh_dc": "sh_dc",
+    "sh_rest": "sh_rest",
+    "logit_base_color": "base_color",
+    "logit_roughness": "roughness",
+    "logit_metallic": "metallic",
+    "delta_normal": "delta_normal",
+    "curvature": "curvature",
+    ENVIRONMENT: "environment",
+    SHADER: "shader",
+}
+_NORMALS, _HELD = ("rotations", "delta_normal", "curvature"), 0.1  # the part of their rates that they have at first
+# A mirror ball, its radius r 3/8 of the picture, turns what its middle reflects by 2/r a pixel: π r/2 rows are told apart
+_ROWS_A_PIXEL, _MOST_ROWS = 3 * np.pi / 16, 512
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The plan of a fit under ``settings`` whose end result is shaded as ``final`` says, reflections included."""
+
+    settings: Settings
+    final: Shading
+
+    @classmethod
+    def of(cls, settings: Settings, shading: Shading) -> "Schedule":
+        """The schedule of a fit to a scene that is shaded as ``shading`` says: ``settings`` decide on ``indirect``, and on
+        whether anything is specular at all."""
+        if settings.specular_start >= 1:
+            return cls(settings, replace(shading, specular="none", diffuse="radiance", indirect="none"))
+        return cls(settings, replace(shading, indirect=settings.indirect))
+
+    def progress(self, steps: int, seconds: float) -> float:
+        """The part of the budget that ``steps`` done in ``seconds`` have spent, in [0, 1]."""
+        s = self.settings
+        if s.iterations is not None:
+            return min(1.0, steps / s.iterations)
+        return min(1.0, seconds / (60 * (s.minutes or 0)))
+
+    def stage(self, progress: float) -> Stage:
+        """The level of the pyramid in use."""
+        stages = self.settings.stages
+        return next((stage for stage in stages if progress < stage.until), stages[-1])
+
+    def sh_order(self, progress: float) -> int:
+        """The order of spherical harmonics in use: one more in each of equal parts of what follows ``sh_start``."""
+        s = self.settings
+        if s.sh_order == 0 or progress < s.sh_start:
+            return 0
+        return min(s.sh_order, 1 + int((progress - s.sh_start) / (1 - s.sh_start + 1e-9) * s.sh_order))
+
+    def shading(self, progress: float) -> Shading:
+        """How the model is shaded by then: nothing specular before ``specular_start``, unless the light makes the diffuse
+        radiance, too; no light sampled before ``monte_carlo_start``; no indirect light before ``indirect_start``."""
+        s, final = self.settings, self.final
+        if final.diffuse != "lit" and progress < s.specular_start:
+            return replace(final, specular="none", indirect="none")
+        early = final.specular == "monte_carlo" and progress < s.monte_carlo_start
+        specular = "split_sum" if early else final.specular
+        indirect = "none" if specular == "none" or progress < s.indirect_start else final.indirect
+        return replace(final, specular=specular, indirect=indirect)
+
+    def value(self, pair: tuple[float, float], progress: float) -> float:
+        """Of a (first, last) ``pair``: geometrically between them, linearly from or to zero."""
+        first, last = pair
+        if min(first, last) <= 0:
+            return first + (last - first) * progress
+        return first * (last / first) ** progress
+
+    def learning_rates(self, names: Iterable[str], progress: float, extent: float, two_sided: bool) -> dict[str, float]:
+        """Adam's rate of each of the parameters ``names``; positions are in units of ``extent``, the object's radius."""
+        s = self.settings
+        rates = {name: self.value(getattr(s.learning_rates, _RATES[name]), progress) for name in names}
+        rates["centers"] *= extent
+        # A light that has no shape yet would turn normals that the hull has right. Two-sided surfels began at random.
+        if progress < s.normals_start and not two_sided:
+            rates |= {name: _HELD * rates[name] for name in _NORMALS}
+        # Adam's steps are as long as its rates, however little there is to gain: what is right trembles to the last
+        if progress > 1 - s.cooldown:
+            rates = {name: rate * (1 - progress) / s.cooldown for name, rate in rates.items()}
+        return rates
+
+    def envmap_height(self, progress: float, height: int, width: int) -> int:
+        """Rows that an environment of ``height`` rows should have by then: twice as many, and twice again, up to
+        `_MOST_ROWS`, while photographs ``width`` pixels wide tell more apart. One that is not learned keeps its own."""
+        s = self.settings
+        if progress >= s.refine_start and any(s.learning_rates.environment):
+            while 2 * height <= _MOST_ROWS and np.sqrt(2) * height < _ROWS_A_PIXEL * width:
+                height *= 2
+        return height
+
+    def refines(self, step: int) -> bool:
+        """Whether density statistics end with this ``step``."""
+        return step % self.settings.density.refine_every == 0
+
+    def surfel_budget(self, progress: float) -> int | None:
+        """How many surfels density control may leave; None where it does not run. The budget opens gradually: what is spent
+        early goes where the coarse images, not the fine ones, need it."""
+        d = self.settings.density
+        if not d.start <= progress < d.stop:
+            return None
+        opened = (progress - d.start) / (d.stop - d.start)
+        first, last = self.settings.initialization.surfels, self.settings.max_surfels
+        return int(first + opened * (last - first))

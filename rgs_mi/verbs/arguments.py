@@ -1,0 +1,84 @@
+"""Arguments that several verbs have."""
+
+import argparse
+import shutil
+import textwrap
+from pathlib import Path
+
+from ..core.errors import listed
+from ..core.scene_files import bundled
+
+
+class Parser(argparse.ArgumentParser):
+    """One whose help ends with all settings, where it has the option --set."""
+
+    shows_settings = False
+
+    def format_help(self):
+        return super().format_help() + (_settings_help() if self.shows_settings else "")
+
+
+def _settings_help():
+    """A line or two for each setting."""
+    from ..settings.fields import walk
+    from ..settings.settings import Settings
+
+    entries, width = [], max(60, shutil.get_terminal_size().columns)
+    for s in walk(Settings):
+        values = ", ".join(filter(None, (s.kind, s.range)))
+        text = textwrap.wrap(f"{values}. {s.description}", width - 6)
+        entries.append("\n      ".join([f"  {s.key} = {s.default}", *text]))
+    return "\n".join(["\nsettings, which --set and YAML files change:", *entries, ""])
+
+
+def add_common(parser, quiet=True):
+    parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
+    if quiet:
+        parser.add_argument("--quiet", action="store_true", help="no progress")
+
+
+def add_integer(parser, name, default, text):
+    parser.add_argument(name, type=int, default=default, help=f"{text} (default: %(default)s)".strip())
+
+
+def add_names(parser, name, text, kind=str, metavar="A,B", **options):
+    parser.add_argument(name, type=listed(kind), metavar=metavar, help=text, **options)
+
+
+def add_out(parser, default, text):
+    parser.add_argument("--out", type=Path, default=Path(default), metavar="DIR", help=f"{text} (default: %(default)s)")
+
+
+def add_variables(parser):
+    parser.add_argument(
+        "-D", dest="define", action="append", default=[], metavar="NAME=VALUE", help="a variable of the scene"
+    )
+
+
+def add_budget(parser, config=True):
+    """What says how to fit."""
+    parser.shows_settings = True
+    if config:
+        parser.add_argument("--config", metavar="PRESET|FILE", help="settings: a preset's name or a YAML file")
+    parser.add_argument("--minutes", type=float, help="plan a fit to end within this time")
+    add_set(parser)
+
+
+def add_set(parser):
+    parser.add_argument(
+        "--set", dest="overrides", action="append", default=[], metavar="A.B=VALUE", help="one setting (see below)"
+    )
+
+
+def check_settings(args):
+    """Refuse bad settings before Mitsuba starts."""
+    from ..settings.config import load_config
+    from ..settings.settings import Settings
+
+    config = getattr(args, "config", None)
+    load_config(Settings, [config] if config else [], args.overrides)
+
+
+def known(kind) -> str:
+    """The names of what comes with the package, in words."""
+    return ", ".join(bundled(kind))

@@ -1,0 +1,104 @@
+"""The verbs that render: render, render-dataset."""
+
+from pathlib import Path
+
+from ..core.errors import parse_variables
+from ..core.runtime import CACHE_VARIABLE, cache_folder, set_variant
+from ..core.scene_files import find_scene
+from .arguments import add_common, add_integer, add_variables, known
+
+
+def render(parser):
+    """Render a fitted scene from one of its views, along them or from a turntable; under another light or with another
+    material."""
+    parser.add_argument("scene", metavar="RUN_OR_SCENE", help=f"a run's folder, an XML file, or {known('scenes')}")
+    add_variables(parser)
+    views = parser.add_mutually_exclusive_group()
+    views.add_argument("--view", metavar="NAME|INDEX", help="a sensor of the scene (default: the first)")
+    views.add_argument("--turntable", type=int, metavar="N", help="N frames around the object")
+    views.add_argument(
+        "--path",
+        type=int,
+        nargs="?",
+        const=0,
+        metavar="N",
+        help="all views in their order, a run's test views; or N frames of a camera that moves from one to the next",
+    )
+    parser.add_argument(
+        "--video",
+        action="store_true",
+        help="make the frames a video, too, and a contact sheet; needs `pip install imageio-ffmpeg`",
+    )
+    parser.add_argument("--size", type=int, metavar="W", help="width in pixels (default: the sensor's)")
+    parser.add_argument(
+        "--spp", type=int, help="samples per pixel; for surfels alone a square number (default: as the scene says)"
+    )
+    parser.add_argument("--out", type=Path, metavar="FILE_OR_DIR", help="where to (default: a folder beside the scene)")
+    parser.add_argument("--aovs", action="store_true", help="write the G-buffer as well, a multichannel EXR")
+    parser.add_argument(
+        "--envmap",
+        metavar="FILE",
+        help="light it by this image, latitude-longitude EXR or HDR, or by an environment of the suite, e.g. kitchen",
+    )
+    parser.add_argument("--rotate", type=float, default=0.0, metavar="DEG", help="turn the light about the vertical")
+    parser.add_argument(
+        "--set",
+        dest="changes",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="the material of all surfels: roughness, metallic or base_color",
+    )
+    add_common(parser)
+
+    def run(args):
+        scene = find_scene(args.scene, "scenes")
+        set_variant(args.variant)
+        from ..export.render import render_scene
+
+        for path in render_scene(
+            scene,
+            variables=parse_variables(args.define),
+            view=args.view,
+            turntable=args.turntable,
+            along=args.path,
+            filmed=args.video,
+            size=args.size,
+            spp=args.spp,
+            out=args.out,
+            aovs=args.aovs,
+            envmap=args.envmap,
+            rotate=args.rotate,
+            changes=args.changes,
+            quiet=args.quiet,
+        ):
+            print(path)
+
+    return run
+
+
+def render_dataset(parser):
+    """Path-trace a Mitsuba scene into a data set in the Blender layout: photographs, cameras, normals and other maps."""
+    parser.add_argument("scene", help=f"an XML file, or {known('targets')}")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help=f"folder to write (default: NAME in that of {CACHE_VARIABLE})"
+    )
+    add_integer(parser, "--train", 60, "training views")
+    add_integer(parser, "--test", 20, "test views")
+    add_integer(parser, "--size", 400, "pixels along a side")
+    add_integer(parser, "--spp", 25, "samples per pixel of training views, test views take 4 times that")
+    parser.add_argument("--radius", type=float, help="distance of the cameras (default: the object fills the frame)")
+    add_variables(parser)
+    add_integer(parser, "--seed", 0, "turns the cameras and reseeds the sampler")
+    add_common(parser)
+
+    def run(args):
+        scene = find_scene(args.scene, "targets")
+        set_variant(args.variant)
+        from ..datasets.path_traced import render_dataset
+
+        numbers = {name: getattr(args, name) for name in ("train", "test", "size", "spp", "radius", "seed", "quiet")}
+        out = args.out or cache_folder(scene.stem)
+        print(render_dataset(scene, out, variables=parse_variables(args.define), **numbers))
+
+    return run
