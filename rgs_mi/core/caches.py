@@ -1,7 +1,9 @@
 """Arrays that take long to compute, and are kept."""
 
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -9,8 +11,12 @@ from .errors import UserError
 from .files import atomic_file
 
 
-def cached_arrays(path, check, compute) -> dict[str, np.ndarray]:
-    """The arrays that the file ``path`` (.npz) keeps; where it is missing or, with a warning, damaged, those that
+def cached_arrays(
+    path: str | Path,
+    check: Callable[[dict[str, np.ndarray]], None],
+    compute: Callable[[], dict[str, np.ndarray]],
+) -> dict[str, np.ndarray]:
+    """Return the arrays that the file ``path`` (.npz) keeps; where it is missing or, with a warning, damaged, those that
     ``compute()`` returns, which are then kept. A disk that takes no more costs the cache, not the result.
 
     Args:
@@ -25,10 +31,10 @@ def cached_arrays(path, check, compute) -> dict[str, np.ndarray]:
             return arrays
         except Exception as error:  # a damaged zip fails in a dozen ways, and each means the same here
             warnings.warn(f"{path} is damaged ({error}): computing it again", stacklevel=3)
-    arrays = compute()
+    computed: dict[str, Any] = compute()
     try:
         with atomic_file(path) as stream:
-            np.savez_compressed(stream, **arrays)
+            np.savez_compressed(stream, **computed)
     except UserError as error:
         warnings.warn(str(error), stacklevel=3)
-    return arrays
+    return computed

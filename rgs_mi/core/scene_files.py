@@ -1,6 +1,7 @@
 """Mitsuba scene files in, scenes out; what is wrong with a file in one line."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import mitsuba as mi
@@ -31,7 +32,7 @@ def find_scene(name: str, kind: str) -> Path:
     return known[name]
 
 
-def load_scene(path: str | Path, variables: dict[str, object]) -> "mi.Scene":
+def load_scene(path: str | Path, variables: Mapping[str, object]) -> "mi.Scene":
     """Load a scene file; ``variables`` override the scene's ``<default>``s. A variant must be active.
 
     Raises: UserError, in one line, for whatever is wrong with the scene.

@@ -1,6 +1,8 @@
 """Contact sheets: pictures in rows and columns on white with words above them, drawn by Matplotlib to the pixel."""
 
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +15,10 @@ _OF_FONT = 1.16  # the same, of Matplotlib's font by itself
 
 
 class Sheet:
-    """``rows`` of pictures [H, W, 3], display values or uint8 (None: nothing), each ``width`` pixels wide and those of a row
-    equally high, ``gap`` pixels apart and ``margin`` from the edges. ``columns``: words above each, of one or more lines of
-    ``text_size`` pixels; ``title``: larger, above all. ``below``: pixels that are left free under the rows."""
+    """A sheet with ``rows`` of pictures [H, W, 3], display values or uint8 (None: nothing), each ``width`` pixels wide and
+    those of a row equally high, ``gap`` pixels apart and ``margin`` from the edges. ``columns`` are the words above each, of
+    one or more lines of ``text_size`` pixels; ``title`` is larger, above all; ``below`` are pixels that are left free under
+    the rows."""
 
     def __init__(
         self,
@@ -48,7 +51,7 @@ class Sheet:
                     self.image(image, margin + k * (width + gap), top, width, height)
             top += height + gap
 
-    def image(self, image: np.ndarray, left: float, top: float, width: float, height: float):
+    def image(self, image: np.ndarray, left: float, top: float, width: float, height: float) -> None:
         """Draw ``image`` into a rectangle of pixels, counted from the sheet's upper left corner."""
         bottom = self.height - top - height
         axes = self.figure.add_axes(
@@ -57,13 +60,13 @@ class Sheet:
         axes.set_axis_off()
         axes.imshow(image, aspect="auto", interpolation="lanczos", interpolation_stage="rgba")
 
-    def text(self, left: float, top: float, words: str, size: float, **options):
+    def text(self, left: float, top: float, words: str, size: float, **options: Any) -> None:
         """Write ``words`` of ``size`` pixels below and to the right of a pixel, unless ``options`` of
         `matplotlib.text.Text` say otherwise."""
         options = {"va": "top", "linespacing": _LINE / _OF_FONT, "parse_math": False} | options
         self.figure.text(left / self.width, 1 - top / self.height, words, size=size * 72 / _DPI, color=INK, **options)
 
-    def write(self, path):
+    def write(self, path: str | Path) -> None:
         """Write the sheet as a PNG. Raises: UserError where it can't be written."""
         with atomic_file(path) as stream:
             self.figure.savefig(stream, format="png", metadata={"Software": None})

@@ -63,7 +63,7 @@ def undistorted(pixels: np.ndarray, camera: Camera, distortion: Distortion, name
     digest = hashlib.sha256(
         repr((_VERSION, name, pixels.dtype, pixels.shape, camera.focal, camera.principal, distortion)).encode()
     )
-    digest.update(np.ascontiguousarray(pixels))
+    digest.update(np.ascontiguousarray(pixels).data)
     path = cache_folder("undistorted") / f"{digest.hexdigest()[:24]}.npz"
 
     def check(arrays):

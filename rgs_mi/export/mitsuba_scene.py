@@ -3,23 +3,42 @@
 import copy
 import warnings
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..core.files import atomic_file, write_exr
+from ..datasets.types import View
+from ..shading.deferred import Shading
+from ..shading.environment import Environment
+from ..shading.shader import Shader
 from ..surfels.ply import write_ply
+from ..surfels.surfels import Surfels
+
+if TYPE_CHECKING:
+    from ..fit.scene import FitScene
 
 SURFELS, ENVIRONMENT, SHADER, SCENE = "object.ply", "environment.exr", "shader.npz", "scene.xml"
 
 
-def export(folder, scene, surfels, environment, shading, shader, views, spp=1) -> list[Path]:
+def export(
+    folder: str | Path,
+    scene: "FitScene",
+    surfels: Surfels,
+    environment: Environment,
+    shading: Shading,
+    shader: Shader | None,
+    views: Sequence[View],
+    spp: int = 1,
+) -> list[Path]:
     """Write ``object.ply``, ``environment.exr``, ``shader.npz`` (where ``shader`` is not None, the identity) and
     ``scene.xml`` into ``folder`` and return their paths.
 
-    The scene is the one that was fitted (a `FitScene`) with the results in place of where the fit started, its
-    ``shading``, and a sensor of ``spp`` samples per pixel for each of ``views``, whose id is the view's
-    name: ``mi.render(mi.load_file("scene.xml"), sensor=i)``.
+    The scene is the one that was fitted with the results in place of where the fit started, its ``shading``, and a sensor of
+    ``spp`` samples per pixel for each of ``views``, whose id is the view's name:
+    ``mi.render(mi.load_file("scene.xml"), sensor=i)``.
     Raises: UserError where the disk is full or the folder can't be written.
     """
     folder = Path(folder)
@@ -49,7 +68,7 @@ def export(folder, scene, surfels, environment, shading, shader, views, spp=1) -
 
 
 def sensor_id(name: str) -> str:
-    """The id of a view's sensor: Mitsuba reads '.' as the path of a parameter."""
+    """Return the id of a view's sensor: Mitsuba reads '.' as the path of a parameter."""
     return name.replace(".", "_")
 
 

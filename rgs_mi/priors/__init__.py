@@ -92,7 +92,7 @@ def _key(name, views, options) -> str:
     digest = hashlib.sha256(json.dumps([_VERSION, name, options], sort_keys=True, default=str).encode())
     for view in views:
         digest.update(f"{view.pixels.dtype} {view.pixels.shape} {view.masked}".encode())
-        digest.update(np.ascontiguousarray(view.pixels))
+        digest.update(np.ascontiguousarray(view.pixels).data)
         if name in ("hull", "stereo"):
             camera = view.camera
             digest.update(np.concatenate([camera.to_world.ravel(), camera.focal, camera.principal, camera.size]).tobytes())
