@@ -50,7 +50,7 @@ _NO_LIMIT = 0xFFFFFFFF
 _SHADOW = 1 - 1e-4  # of the way to a light, so as not to meet it
 
 
-class PathIntegrator(mi.SamplingIntegrator):
+class SurfelPathIntegrator(mi.SamplingIntegrator):
     def __init__(self, props):
         super().__init__(props)  # takes hide_emitters
         if not mi.is_rgb:
@@ -145,7 +145,7 @@ class PathIntegrator(mi.SamplingIntegrator):
         return dr.select(seen, L, 0), seen, []
 
     def to_string(self):
-        return f"PathIntegrator[diffuse = {self.diffuse}]"
+        return f"SurfelPathIntegrator[diffuse = {self.diffuse}]"
 
 
 def _interaction(ray, hit):
@@ -164,4 +164,4 @@ def _mis(pdf, other):
     return dr.select(pdf > 0, pdf / (pdf + other), 0)
 
 
-mi.register_integrator("rgs_path", PathIntegrator)
+mi.register_integrator("rgs_path", SurfelPathIntegrator)

@@ -10,7 +10,7 @@ from ..core.arrays import as_float
 from ..core.files import atomic_file
 from ..core.progress import Progress
 from ..evaluation.metrics import relative_error
-from ..shading.environment import Environment
+from ..shading.environment import Environment, FilteredEnvironment
 from ..shading.monte_carlo import MonteCarlo
 from ..shading.split_sum import DEFAULT_ETA, SplitSum
 from ..shading.taps import COUNT, SHAPE
@@ -23,10 +23,10 @@ _MATERIALS = ((0.0, 0.0), (1.0, 1.0), (0.0, 0.0), (1.0, 0.5), (0.0, 0.0), (1.0, 
 
 
 @dataclass
-class Lanes:
+class Samples:
     """Surfaces in one environment, and what they truly reflect."""
 
-    environment: object
+    environment: FilteredEnvironment
     surfaces: tuple
     truth: "mi.Color3f"
 
@@ -65,7 +65,7 @@ def fit_taps(path, environments: int, steps: int, seed: int):
     print(f"{path}: error in environments that were held out {', '.join(f'{e:.2%}' for e in errors)}")
 
 
-def sampled(texels: np.ndarray, metallic: float, base_color: float, seed: int) -> Lanes:
+def sampled(texels: np.ndarray, metallic: float, base_color: float, seed: int) -> Samples:
     """What random surfaces of all roughness, seen as a distant sphere's, reflect of ``texels`` [rows, columns, 3]."""
     rng = np.random.default_rng(seed)
     normal = _unit(rng.normal(size=(_SURFACES, 3)))
@@ -89,7 +89,7 @@ def sampled(texels: np.ndarray, metallic: float, base_color: float, seed: int) -
         )
         truth = estimator.specular(*surfaces)
         dr.eval(truth)
-    return Lanes(environment.filtered(), surfaces, truth)
+    return Samples(environment.filtered(), surfaces, truth)
 
 
 def random_environment(rng) -> np.ndarray:

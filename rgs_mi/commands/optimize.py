@@ -15,6 +15,7 @@ from ..core.files import make_folder
 from ..core.interrupt import GracefulInterrupt
 from ..core.progress import Progress
 from ..core.runtime import cache_folder
+from ..datasets.types import Dataset
 from ..fit import checkpoint
 from ..fit.events import Events
 from ..fit.model import Model
@@ -24,6 +25,7 @@ from ..priors import depth_priors
 from ..priors.initialization import initial_points, surroundings
 from ..report import results
 from ..settings.config import to_dict
+from ..settings.settings import Settings
 
 _ON_SURFACE, _ANYWHERE = 0.7, 0.1  # opacities to start with; where surfels fill space, more would hide what is within
 _SMOOTHING = 0.95  # of the PSNR that the progress line shows
@@ -91,7 +93,7 @@ def _saved(folder, resume):
     return None
 
 
-def start(scene, dataset, settings, quiet=True) -> Fit:
+def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = True) -> Fit:
     """A fit at its beginning."""
     begin = settings.initialization
     points = initial_points(dataset, begin.surfels, settings.seed, begin.hull, begin.carve, quiet)
@@ -104,8 +106,12 @@ def start(scene, dataset, settings, quiet=True) -> Fit:
         extent = shading.box.radius
         points = _with_surroundings(points, dataset, settings)
     light = scene.environment
+    positions, normals, colors, spacing = points
     model = Model.start(
-        *points,
+        positions,
+        normals,
+        colors,
+        spacing,
         light.texels.numpy(),
         light.rotation,
         settings.sh_order,
@@ -124,8 +130,8 @@ def _with_surroundings(points, dataset, settings):
     positions, _, colors, spacing = points
     normals = np.random.default_rng((settings.seed, 2)).normal(size=positions.shape)
     near = positions, normals / np.linalg.norm(normals, axis=1, keepdims=True), colors, spacing
-    far = surroundings(dataset, settings.initialization.surroundings, settings.seed)
-    return [np.concatenate(pair) for pair in zip(near, far)]
+    far: tuple = surroundings(dataset, settings.initialization.surroundings, settings.seed)
+    return tuple(np.concatenate(pair) for pair in zip(near, far))
 
 
 def _shading(scene, dataset, settings):
@@ -136,7 +142,7 @@ def _shading(scene, dataset, settings):
     try:
         box = None if settings.box is None else BoundingBox.of(settings.box)
     except ValueError as error:
-        raise UserError(f"settings: box {list(settings.box)}: {error}") from error
+        raise UserError(f"settings: box {settings.box}: {error}") from error
     if box is None and not any(view.masked for view in dataset.train):
         box = BoundingBox.seen_by([view.camera for view in dataset.train])
     return replace(scene.shading, box=box)

@@ -55,15 +55,16 @@ def recovery(run, truth, lights=(), *, size=400, out=None, quiet=False) -> dict:
     scene, true_scene = load_scene(path, {}), load_scene(truth, {})
     surfels_of(scene, path)
     own = _views(truth, {}, size, quiet)
-    figures = _materials(scene, path, own) | {"environment_log_rmse": _environment(scene, true_scene, own), "relit": {}}
+    figures, relit_scores = _materials(scene, path, own), {}
+    figures["environment_log_rmse"] = _environment(scene, true_scene, own)
     for light in lights:
         views = _views(truth, {"environment": light}, size, quiet)
         relit = load_scene(path, {})
         relight(relit, path, light)
-        figures["relit"][light] = _compare(relit, views, out / f"relit_{light}.png")
+        relit_scores[light] = _compare(relit, views, out / f"relit_{light}.png")
     with atomic_file(out / RECOVERY) as stream:
-        stream.write((json.dumps(figures, indent=1) + "\n").encode())
-    return figures
+        stream.write((json.dumps(figures | {"relit": relit_scores}, indent=1) + "\n").encode())
+    return figures | {"relit": relit_scores}
 
 
 def _views(truth, variables, size, quiet):

@@ -7,6 +7,7 @@ vertex in the header's order. What a file may hold behind its vertices, such as 
 import os
 import re
 import warnings
+from pathlib import Path
 
 import numpy as np
 
@@ -22,7 +23,7 @@ _TYPES = {
 _NAMES = {_TYPES[name]: name for name in list(_TYPES)[:8]}
 
 
-def read_vertices(path) -> np.ndarray:
+def read_vertices(path: str | Path) -> np.ndarray:
     """The vertices of a PLY file as a structured array [N], N > 0, with a field a property, in the file's types.
 
     Memory is taken for what the file holds, not for what its header promises.
@@ -47,17 +48,22 @@ def read_vertices(path) -> np.ndarray:
         vertices = read(stream, size - start, before, count, _record(properties, _ORDERS[form]))
     if len(vertices) < count:
         raise ValueError(f"it ends before the last of its {count} vertices")
-    return vertices
+    return np.asarray(vertices)
 
 
-def write_vertices(path, vertices: np.ndarray):
+def names_of(vertices: np.ndarray) -> tuple[str, ...]:
+    """The names of the properties of a structured array."""
+    return vertices.dtype.names or ()
+
+
+def write_vertices(path: str | Path, vertices: np.ndarray) -> None:
     """Write a structured array [N], with a field a property, as the vertices of a binary little-endian PLY; the file appears
     whole or not at all.
 
     Raises: UserError where the disk is full or the folder can't be written.
     """
     little = vertices.astype(vertices.dtype.newbyteorder("<"))
-    properties = [f"property {_NAMES[little.dtype[name].str[1:]]} {name}" for name in little.dtype.names]
+    properties = [f"property {_NAMES[little.dtype[name].str[1:]]} {name}" for name in names_of(little)]
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(little)}", *properties, "end_header", ""]
     with atomic_file(path) as stream:
         stream.write("\n".join(header).encode("ascii"))
@@ -71,8 +77,8 @@ def _header(head: bytes):
     """(format, elements, bytes of the header) of a file that begins with ``head``; an element is (name, count, properties),
     a property (name, type), where the type may be 'list'."""
     first = re.match(rb"ply(\r\n|\n|\r)", head)
-    end = first and head.find(first[1] + b"end_header" + first[1])
-    if not end or end < 0:
+    end = head.find(first[1] + b"end_header" + first[1]) if first else -1
+    if first is None or end < 0:
         raise ValueError("it has no PLY header")
     form, elements = None, []
     for line in head[first.end() : end].split(first[1]):

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..core.color import srgb_decode
 from ..core.errors import UserError
-from ..core.ply_format import read_vertices
+from ..core.ply_format import names_of, read_vertices
 
 FILES = (
     "points3d.ply",
@@ -76,9 +76,9 @@ def _read_ply(path):
         with np.errstate(invalid="ignore"):  # signalling NaN
             return np.stack([vertices[name].astype(np.float64) for name in names], -1)
 
-    if missing := {"x", "y", "z"} - set(vertices.dtype.names):
+    if missing := {"x", "y", "z"} - set(names_of(vertices)):
         raise ValueError(f"its vertices have no property '{min(missing)}'")
-    if not {"red", "green", "blue"} <= set(vertices.dtype.names):
+    if not {"red", "green", "blue"} <= set(names_of(vertices)):
         return columns("x", "y", "z"), None
     scale = [1.0 if vertices.dtype[name].kind == "f" else 255.0 for name in ("red", "green", "blue")]
     return columns("x", "y", "z"), columns("red", "green", "blue") / scale

