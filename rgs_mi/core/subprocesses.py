@@ -5,7 +5,7 @@ import os
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from multiprocessing.connection import wait
 from typing import Any
 
@@ -31,7 +31,7 @@ def apart(function: Callable, *arguments: object) -> Any:
 
 def each_apart(
     function: Callable, calls: Iterable[tuple], workers: int = 1
-) -> Iterator[tuple[tuple, Any, UserError | None]]:
+) -> Generator[tuple[tuple, Any, UserError | None], None, None]:
     """Call ``function`` as `apart` does for each of ``calls``, tuples of arguments, up to ``workers`` at a time, among which
     the cores are divided.
 

@@ -20,6 +20,7 @@ import json
 import math
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -266,7 +267,7 @@ def render_dataset(
     size: int = 400,
     spp: int = 25,
     radius: float | None = None,
-    variables: dict[str, object] | None = None,
+    variables: Mapping[str, object] | None = None,
     seed: int = 0,
     quiet: bool = False,
 ) -> Path:
