@@ -3,10 +3,19 @@
 import functools
 import importlib
 import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 
 from rgs_mi.core.errors import UserError
+
+if TYPE_CHECKING:
+    from rgs_mi.shading.deferred import Lighting
+    from rgs_mi.surfels.surfels import Surfels
+
+    from .rgs_deferred import DeferredIntegrator
+    from .surfels import SurfelShape
 
 _MODULES = ("procedural", "wavefront", "surfels", "rgs_deferred", "rgs_path")
 
@@ -21,14 +30,14 @@ def _load(_old, new):
 
 
 @functools.cache
-def register():
+def register() -> None:
     """Register all plugins with Mitsuba; calling it again does nothing."""
     mi.detail.add_variant_callback(_load)
     if mi.variant():
         _load(None, mi.variant())
 
 
-def surfels_of(scene, path):
+def surfels_of(scene: "mi.Scene", path: str | Path) -> "SurfelShape":
     """The scene's one `surfels` shape. Raises: UserError where there is none, or more."""
     from .surfels import SurfelShape  # of the variant that is active now
 
@@ -38,14 +47,14 @@ def surfels_of(scene, path):
     return found[0]
 
 
-def is_deferred(integrator) -> bool:
+def is_deferred(integrator: "mi.Integrator") -> bool:
     """Whether the integrator is an 'rgs_deferred'."""
     from .rgs_deferred import DeferredIntegrator
 
     return isinstance(integrator, DeferredIntegrator)
 
 
-def deferred_of(scene, path):
+def deferred_of(scene: "mi.Scene", path: str | Path) -> "DeferredIntegrator":
     """The scene's integrator. Raises: UserError where it is another than 'rgs_deferred'."""
     integrator = scene.integrator()
     if not is_deferred(integrator):
@@ -53,7 +62,7 @@ def deferred_of(scene, path):
     return integrator
 
 
-def lit_surfels(scene, path):
+def lit_surfels(scene: "mi.Scene", path: str | Path) -> "tuple[Surfels, Lighting | None]":
     """The scene's `Surfels`, and the `Lighting` by which its integrator shades them (None: diffuse radiance alone).
 
     Raises: UserError where there are no surfels, more than one shape of them, or another integrator than 'rgs_deferred'.

@@ -27,7 +27,7 @@ from rgs_mi import targets
 from rgs_mi.targets import environments
 
 
-def procedural_mesh(props):
+def procedural_mesh(props: "mi.Properties") -> "mi.Mesh":
     """The factory of ``<shape type="procedural_mesh">``."""
     part = targets.mesh(str(props["model"]), str(props["part"]))
     to_world = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, np.float64)
@@ -43,7 +43,7 @@ def procedural_mesh(props):
     return mesh
 
 
-def procedural_envmap(props):
+def procedural_envmap(props: "mi.Properties") -> "mi.Emitter":
     """The factory of ``<emitter type="procedural_envmap">``."""
     if props["name"] == "constant":
         pixels = environments.constant(float(props.get("radiance", 0.5)), int(props.get("height", 128)))

@@ -64,6 +64,7 @@ but ``monte_carlo``, whose samples ``seed`` decides.
 """
 
 from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -72,11 +73,12 @@ from rgs_mi.plugins.surfels import box_of, resolve, surfels_in
 from rgs_mi.core.camera import Camera
 from rgs_mi.core.errors import UserError
 from rgs_mi.shading import deferred, indirect
-from rgs_mi.shading.deferred import Shading
-from rgs_mi.shading.environment import Environment
+from rgs_mi.shading.deferred import Lighting, Shading
+from rgs_mi.shading.environment import Environment, FilteredEnvironment
 from rgs_mi.shading.lighting import lighting_of
 from rgs_mi.shading.monte_carlo import SAMPLES
 from rgs_mi.shading.shader import Shader
+from rgs_mi.surfels.surfels import Surfels
 
 AOVS = {
     "depth": "T",
@@ -111,7 +113,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         self.aovs = _aovs(props.get("aovs", ""))
         self.filtered = None
 
-    def aov_names(self):
+    def aov_names(self) -> list[str]:
         return [f"{name}.{channel}" for name, kind in self.aovs.items() for channel in AOVS[kind]]
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
@@ -162,12 +164,14 @@ class DeferredIntegrator(mi.SamplingIntegrator):
             values += _aov(kind, image, maps, camera, rays)
         return _average(values, width, height, samples)
 
-    def lighting(self, scene, surfels, eta, environment, seed):
+    def lighting(
+        self, scene: "mi.Scene", surfels: Surfels, eta: float, environment: FilteredEnvironment | None, seed: int
+    ) -> Lighting | None:
         """By what `deferred.shade` shades ``surfels`` in the ``scene``, whose `environment` this is; None: nothing."""
         shading = Shading(self.specular, self.diffuse, self.samples, eta, self.box, self.indirect)
         return lighting_of(shading, surfels, environment, scene.environment(), self.shader, seed)
 
-    def environment(self, scene):
+    def environment(self, scene: "mi.Scene") -> FilteredEnvironment | None:
         """The scene's environment, filtered as the estimator needs it; kept until texels change."""
         emitter = scene.environment()
         if emitter is None:
@@ -184,7 +188,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         return replace(self.filtered, environment=environment)
 
 
-def _choice(props, name, default, choices):
+def _choice(props, name, default, choices) -> Any:
     value = props.get(name, default)
     if value not in choices:
         raise UserError(f"rgs_deferred: unknown {name} '{value}': choose one of {', '.join(choices)}")

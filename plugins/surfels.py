@@ -12,7 +12,9 @@ Flat Gaussians with a principled material (`rgs_mi.surfels.surfels.Surfels`), fo
 
  * - centers, rotations, scales, opacities, sh, base_color, roughness, metallic, delta_normal, curvature
    - |tensor|
-   - The fields themselves, in physical ranges; in a dictionary only. They replace those of the file.
+   - The fields themselves, in physical ranges, a row for each surfel (`rgs_mi.surfels.surfels.Surfels` has the numbers in a
+     row); in a dictionary only. They replace those of the file. ``rotations`` are unit quaternions (x, y, z, w), Mitsuba's
+     order; the columns ``rot_0`` to ``rot_3`` of a PLY are (w, x, y, z), as 3DGS has them, and are turned round on reading.
    - |exposed|, |differentiable|; the first three also |discontinuous|
 
  * - two_sided
@@ -25,7 +27,7 @@ Flat Gaussians with a principled material (`rgs_mi.surfels.surfels.Surfels`), fo
 
  * - proxies
    - |bool|
-   - Whether rays hit the surfels, as quads of three standard deviations, two triangles each: surfel number i is
+   - Whether rays hit the surfels, as quads of three standard deviations, two triangles each: surfel i is
      ``prim_index // 2``. They are opaque and diffuse to Mitsuba's integrators, and moving them rebuilds the
      acceleration structure. (Default: |false|, rays pass)
 
@@ -129,7 +131,7 @@ class SurfelShape(mi.Mesh):
         return f"Surfels[id = {self.id()}, count = {len(self.surfels)}, proxies = {self.proxies}]"
 
 
-def surfels_in(scene):
+def surfels_in(scene: "mi.Scene") -> tuple[Surfels, float]:
     """(all surfels of the scene as one `Surfels`, their index of refraction).
 
     Raises: UserError where there are none, or they differ in what all have to share.
@@ -157,7 +159,7 @@ def _concatenate(clouds):
     return replace(clouds[0], **fields)
 
 
-def box_of(props):
+def box_of(props: "mi.Properties") -> BoundingBox | None:
     """The property ``box`` of an integrator as a `BoundingBox`, None where it has none. Raises: UserError for a bad one."""
     text = props.get("box", "")
     try:

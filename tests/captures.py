@@ -6,7 +6,6 @@ import struct
 
 import numpy as np
 from PIL import Image
-from plyfile import PlyData, PlyElement
 from scipy.spatial.transform import Rotation
 
 from rgs_mi.core.camera import Camera
@@ -211,5 +210,29 @@ def write_cloud(path, points=POINTS, colors=COLORS):
     rows = np.zeros(len(points), [(n, "f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")])
     for column, name in enumerate(rows.dtype.names):
         rows[name] = np.hstack([points, colors])[:, column]
-    PlyData([PlyElement.describe(rows, "vertex")]).write(str(path))
+    return write_ply_rows(path, rows)
+
+
+PLY_TYPES = {
+    "i1": "char",
+    "u1": "uchar",
+    "i2": "short",
+    "u2": "ushort",
+    "i4": "int",
+    "u4": "uint",
+    "f4": "float",
+    "f8": "double",
+}
+
+
+def write_ply_rows(path, rows, text=False, byte_order="<", before=(b"", b""), after=(b"", b"")):
+    """A structured array as the vertices of a PLY; ``before`` and ``after``: (header, data) of other elements."""
+    form = "ascii" if text else {"<": "binary_little_endian", ">": "binary_big_endian"}[byte_order]
+    header = f"ply\nformat {form} 1.0\n".encode() + before[0] + f"element vertex {len(rows)}\n".encode()
+    for name in rows.dtype.names:
+        header += f"property {PLY_TYPES[rows.dtype[name].str[1:]]} {name}\n".encode()
+    data = "".join(" ".join(map(repr, row)) + "\n" for row in rows.tolist()).encode()
+    if not text:
+        data = rows.astype(rows.dtype.newbyteorder(byte_order)).tobytes()
+    path.write_bytes(header + after[0] + b"end_header\n" + before[1] + data + after[1])
     return path

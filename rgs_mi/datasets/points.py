@@ -6,10 +6,10 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyParseError
 
 from ..core.color import srgb_decode
 from ..core.errors import UserError
+from ..core.ply_format import read_vertices
 
 FILES = (
     "points3d.ply",
@@ -24,7 +24,6 @@ FILES = (
     "points3D.txt",
 )
 FARTHEST = 1e6  # as for cameras; a coordinate beyond is damage or an outlier that no photograph shows
-_PLY_HEADER_LIMIT = 1 << 20  # bytes
 _COLMAP_POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 _COLMAP_TRACK_ITEM = 8  # bytes: int32 image, int32 keypoint
 
@@ -44,7 +43,7 @@ def sparse_points(root: Path, files=FILES) -> tuple[np.ndarray, np.ndarray | Non
     try:
         positions, encoded = read(path)
         _check(positions, encoded)
-    except (OSError, PlyParseError, ValueError, OverflowError, MemoryError) as error:
+    except (OSError, ValueError, OverflowError, MemoryError) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise UserError(
             f"{path} cannot be used as a point cloud ({reason}): export it again, or remove it to start without one"
@@ -71,9 +70,7 @@ def _check(positions, encoded):
 
 def _read_ply(path):
     """``x y z`` and, if all three are there, ``red green blue`` of the vertices; ASCII or binary of either order."""
-    with open(path, "rb") as stream:
-        _check_ply_header(stream.read(_PLY_HEADER_LIMIT), path.stat().st_size)
-    vertices = PlyData.read(str(path))["vertex"].data
+    vertices = read_vertices(path)
 
     def columns(*names):
         with np.errstate(invalid="ignore"):  # signalling NaN
@@ -85,32 +82,6 @@ def _read_ply(path):
         return columns("x", "y", "z"), None
     scale = [1.0 if vertices.dtype[name].kind == "f" else 255.0 for name in ("red", "green", "blue")]
     return columns("x", "y", "z"), columns("red", "green", "blue") / scale
-
-
-def _check_ply_header(head: bytes, size: int):
-    """Refuse what would make plyfile allocate more than a file of ``size`` bytes can hold.
-
-    Lines are split as plyfile does it, or a header could say one thing here and another there.
-    """
-    newline = b"\r\n" if head[3:5] == b"\r\n" else head[3:4]
-    header, end, _ = head.partition(newline + b"end_header" + newline)
-    if not head.startswith(b"ply") or newline not in (b"\n", b"\r", b"\r\n") or not end:
-        raise ValueError("it has no PLY header")
-    elements = []  # [name, count, properties, lists]
-    for line in header.decode("ascii").split(newline.decode()):
-        match line.split():
-            case ["element", name, count]:
-                elements.append([name, int(count), 0, 0])
-            case ["property", kind, *_] if elements:
-                elements[-1][2] += 1
-                elements[-1][3] += kind == "list"
-    if not any(name == "vertex" and count for name, count, *_ in elements):
-        raise ValueError("it holds no points: no elements 'vertex'")
-    for name, count, properties, lists in elements:
-        if not 0 <= count * max(properties, 1) <= size:
-            raise ValueError(f"it declares {count} elements '{name}' in {size} bytes")
-        if lists and (count or name == "vertex"):
-            raise ValueError(f"its elements '{name}' have lists, as a mesh's faces do")
 
 
 # ---- COLMAP ----

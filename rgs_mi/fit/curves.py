@@ -8,6 +8,8 @@ import csv
 import io
 import json
 import math
+from collections.abc import Iterable
+from pathlib import Path
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
@@ -17,12 +19,12 @@ STRETCHES = 300  # of equal parts of the budget; a fit has that many rows, or on
 
 
 class Curves:
-    """``rows``: a dictionary a stretch, oldest first, JSON values; what a checkpoint keeps."""
+    """The curves of a fit. ``rows`` are what a checkpoint keeps: a dictionary for each stretch, oldest first, JSON values."""
 
-    def __init__(self, rows=()):
+    def __init__(self, rows: Iterable[dict] = ()) -> None:
         self.rows = list(rows)
-        self._stretch = None  # number of the one that has begun
-        self._sums = {}  # name -> sum and count over its steps
+        self._stretch: int | None = None  # index of the one that has begun
+        self._sums: dict[str, tuple[float, int]] = {}  # name -> sum and count over its steps
 
     def add(self, progress: float, state: dict, measured: dict) -> bool:
         """Note a step: ``state`` as it is now, ``measured`` to be averaged (what is not finite is left out).
@@ -38,7 +40,7 @@ class Curves:
         self._stretch, self._sums = stretch, {}
         return True
 
-    def write(self, folder):
+    def write(self, folder: Path) -> None:
         """``FOLDER/curves.csv``. Raises: UserError where the disk is full or the folder can't be written."""
         text = io.StringIO()
         names = dict.fromkeys(name for row in self.rows for name in row)
@@ -49,7 +51,7 @@ class Curves:
             stream.write(text.getvalue().encode())
 
     @classmethod
-    def read(cls, folder) -> "Curves":
+    def read(cls, folder: Path) -> "Curves":
         """What `write` wrote; empty where there is none. Raises: UserError where it is damaged."""
         path = folder / FILE
         if not path.is_file():
@@ -60,7 +62,7 @@ class Curves:
         except (ValueError, TypeError, csv.Error) as error:
             raise UserError(f"{path}: damaged ({error}): delete it, the report then has no curves") from error
 
-    def column(self, name) -> list:
+    def column(self, name: str) -> list[float]:
         """Its value in each row, NaN where a row has none."""
         return [row.get(name, math.nan) for row in self.rows]
 

@@ -22,9 +22,10 @@ class Gradients:
 
     def add(self, gradient: "mi.Vector2f", seen: "mi.Bool", size: tuple[int, int]) -> None:
         """``gradient``: of the loss with respect to the projected centres in pixels, ``mi.Vector2f``; ``seen``: which
-        surfels the view of ``size`` (width, height) listed. Kept in NDC units, as 3DGS measures it."""
-        ndc = mi.Vector2f(gradient.x * (size[0] / 2), gradient.y * (size[1] / 2))
-        self.sum += dr.select(seen, dr.norm(ndc), 0)
+        surfels the view of ``size`` (width, height) listed. Kept in NDC units, as 3DGS measures it; one that overflowed
+        counts as zero."""
+        length = dr.norm(mi.Vector2f(gradient.x * (size[0] / 2), gradient.y * (size[1] / 2)))
+        self.sum += dr.select(seen & dr.isfinite(length), length, 0)
         self.count += dr.select(seen, mi.Float(1), 0)
         dr.eval(self.sum, self.count)
 

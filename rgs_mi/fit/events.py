@@ -3,6 +3,7 @@
 import time
 import warnings
 from pathlib import Path
+from typing import Any
 
 from ..core.errors import UserError
 
@@ -13,14 +14,16 @@ class Events:
     Raises: UserError where tensorboardX is not installed or the folder can't be written.
     """
 
-    def __init__(self, folder, step: int):
+    def __init__(self, folder: str | Path, step: int) -> None:
         try:
             from tensorboardX.event_file_writer import EventsWriter
-            from tensorboardX.proto.event_pb2 import Event, SessionLog
-            from tensorboardX.proto.summary_pb2 import Summary
+            from tensorboardX.proto import event_pb2, summary_pb2
         except ImportError as error:
             raise UserError("--tensorboard: tensorboardX is not installed: pip install tensorboardX") from error
-        self._event, self._summary, self.folder = Event, Summary, Path(folder)
+        # their classes are made at import, where no type checker sees them
+        self._event: Any = event_pb2.Event  # pyright: ignore[reportAttributeAccessIssue]
+        self._summary: Any = summary_pb2.Summary  # pyright: ignore[reportAttributeAccessIssue]
+        self.folder = Path(folder)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             if step == 0:
@@ -34,9 +37,10 @@ class Events:
                 "free space, or leave out --tensorboard"
             ) from error
         if step > 0:  # what was written after the checkpoint that the fit goes on from no longer counts
-            self._write(step + 1, session_log=SessionLog(status=SessionLog.START))
+            session_log: Any = event_pb2.SessionLog  # pyright: ignore[reportAttributeAccessIssue]
+            self._write(step + 1, session_log=session_log(status=session_log.START))
 
-    def add(self, row: dict):
+    def add(self, row: dict) -> None:
         """A row of the curves: a scalar for each of its columns but ``step``. A full disk costs the row, not the fit."""
         scalars = {name.replace(".", "/"): value for name, value in row.items() if name != "step"}
         values = [self._summary.Value(tag=name, simple_value=value) for name, value in scalars.items()]

@@ -1,11 +1,13 @@
-"""Image losses and geometric regularisers, all on Dr.Jit arrays with a lane a pixel (row-major)."""
+"""Image losses and geometric regularisers, all on Dr.Jit arrays with one entry per pixel (row-major)."""
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import as_float
+from ..core.camera import Camera
 from ..shading.deferred import COVERED
+from ..splat.gbuffer import GBuffer, Maps
 from ..splat.hit import adding
 from ..splat.project import opaque
 
@@ -17,13 +19,13 @@ _APART, _BEND = 0.015, 0.015  # of `minimum_variation`: part of the image's widt
 _FLAT = 1e-6  # standard deviation of a depth map, in units of its depth, up to which it is constant
 
 
-def srgb(x):
+def srgb(x: "mi.Color3f") -> "mi.Color3f":
     """The sRGB curve, continued above one; negative values count as zero."""
     x = dr.maximum(x, 0)
     return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * dr.power(dr.maximum(x, 0.0031308), 1 / 2.4) - 0.055)
 
 
-def display(color, alpha, background):
+def display(color: "mi.Color3f", alpha: "mi.Float", background: float) -> "mi.Color3f":
     """Premultiplied linear ``color`` over ``background`` (a display-space grey level) in display space, as data sets with
     straight alpha are composited: srgb(color / alpha) alpha + background (1 − alpha)."""
     covered = alpha > COVERED
@@ -66,7 +68,7 @@ class _Blur(dr.CustomOp):
         return "rgs_mi.fit.losses.Blur"
 
 
-def ssim(image, target, size):
+def ssim(image: "mi.Color3f", target: "mi.Color3f", size: tuple[int, int]) -> "mi.Float":
     """Mean structural similarity of two ``mi.Color3f`` images (11 × 11 Gaussian window, σ 1.5), differentiable in the
     first."""
     with dr.suspend_grad():
@@ -79,7 +81,7 @@ def ssim(image, target, size):
     return dr.mean(dr.mean(value))
 
 
-def photometric(image, target, size, dssim):
+def photometric(image: "mi.Color3f", target: "mi.Color3f", size: tuple[int, int], dssim: float) -> "mi.Float":
     """(1 − λ) L1 + λ (1 − SSIM)/2 with λ = ``dssim`` (3DGS). Where the photograph is saturated a brighter rendering is no
     error, and a too bright rendering elsewhere still feels its gradient."""
     image = dr.select(target >= SATURATED, dr.minimum(image, target), image)
@@ -87,13 +89,13 @@ def photometric(image, target, size, dssim):
     return (1 - dssim) * l1 + dssim * (1 - ssim(image, target, size)) / 2
 
 
-def mask(alpha, target):
+def mask(alpha: "mi.Float", target: "mi.Float") -> "mi.Float":
     """Mean absolute difference of coverage and mask."""
     return dr.mean(dr.abs(alpha - target))
 
 
 def _interior(gbuffer):
-    """Numbers of the pixels that are covered together with their four neighbours."""
+    """Indices of the pixels that are covered together with their four neighbours."""
     width, height = gbuffer.size
     with dr.suspend_grad():
         alpha = gbuffer.all.alpha
@@ -106,9 +108,9 @@ def _interior(gbuffer):
         return dr.compress(inner)
 
 
-def depth_normal_consistency(gbuffer, camera):
-    """2DGS's regulariser: mean of 1 − n·n_D over the image, with n the rendered normal and n_D that of the surface which
-    the rendered (expected) depth describes, by central differences."""
+def depth_normal_consistency(gbuffer: GBuffer, camera: Camera) -> "mi.Float":
+    """Depth-normal consistency (2DGS): the mean of 1 − n·n_D over the image, with n the rendered normal and n_D that of the
+    surface which the rendered (expected) depth describes, by central differences."""
     width, height = gbuffer.size
     index = _interior(gbuffer)
     if dr.width(index) == 0:
@@ -127,13 +129,13 @@ def depth_normal_consistency(gbuffer, camera):
     return dr.sum(1 - dr.dot(n, n_depth)) / (width * height)
 
 
-def distortion(maps, extent):
+def distortion(maps: Maps, extent: float) -> "mi.Float":
     """2DGS's depth distortion, mean over the image of Σ_ij w_i w_j (t_i − t_j)² = 2 (Σw Σwt² − (Σwt)²), in units of
     ``extent``², the object's radius: surfels along a ray draw together. ``maps``: all `Maps`."""
     return dr.mean(2 * (maps.alpha * maps.square - dr.square(maps.depth))) / dr.opaque(mi.Float, float(extent) ** 2)
 
 
-def normal_smoothness(gbuffer, reflective, crease=0.0):
+def normal_smoothness(gbuffer: GBuffer, reflective: np.ndarray, crease: float = 0.0) -> "mi.Float":
     """RGS's L_normal: mean squared forward difference of N from pixel to pixel, where both are ``reflective`` (β̂, [H, W]
     bool, NumPy). With ``crease``, d² counts as d² / (1 + d²/crease²): noise of a few degrees is smoothed, an edge of the
     object is let be."""
@@ -152,7 +154,7 @@ def normal_smoothness(gbuffer, reflective, crease=0.0):
     return 2 * total / dr.maximum(pairs, 1)
 
 
-def minimum_variation(gbuffer, reflective, corner=(0, 0)):
+def minimum_variation(gbuffer: GBuffer, reflective: np.ndarray, corner: tuple[int, int] = (0, 0)) -> "mi.Float":
     """How fast the curvature of smooth surfaces changes (minimum-variation surfaces, Moreton and Séquin 1992). Where a flat
     mirror shows each part of the environment to few photographs, they agree with any wobble of it; held-out views don't.
 
@@ -184,17 +186,17 @@ def minimum_variation(gbuffer, reflective, corner=(0, 0)):
     return total / dr.opaque(mi.Float, max(count, 1))
 
 
-def delta_normal(gbuffer):
+def delta_normal(gbuffer: GBuffer) -> "mi.Float":
     """RGS's L_Δn: mean ‖ΔN‖ over the image, of which ``gbuffer`` has all maps."""
     length2 = dr.squared_norm(gbuffer.all.delta_normal)
     nonzero = length2 > 0
     return dr.sum(dr.select(nonzero, dr.sqrt(dr.select(nonzero, length2, 1)), 0)) / (gbuffer.size[0] * gbuffer.size[1])
 
 
-def pearson_depth(depth, prior, valid, inverse=False):
+def pearson_depth(depth: "mi.Float", prior: "mi.Float", valid: "mi.Bool", inverse: bool = False) -> "mi.Float":
     """RGS's L_depth: 1 − r, with r Pearson's correlation of the rendered z-depth and a prior's over the ``valid`` pixels.
 
-    ``depth``, ``prior``: ``mi.Float``, a lane a pixel; ``valid``: ``mi.Bool``, where both are known (pixels where one is not
+    ``depth``, ``prior``: one entry per pixel; ``valid``: where both are known (pixels where one is not
     finite never count). ``inverse``: the prior holds inverse depths, which are compared with 1/z (z > 0 where valid).
     Differentiable in ``depth``. r knows neither scale nor shift of the prior; where one of the two maps is constant, or
     fewer than two pixels are valid, it isn't defined, and the loss and its gradient are 0.
@@ -205,14 +207,14 @@ def pearson_depth(depth, prior, valid, inverse=False):
             valid &= depth > 0
         count = mi.Float(dr.maximum(dr.count(valid), 1))
     x = dr.rcp(dr.select(valid, depth, 1)) if inverse else depth
-    x, spread_x = _centred(x, valid, count)
-    y, spread_y = _centred(prior, valid, count)
+    x, spread_x = _centered(x, valid, count)
+    y, spread_y = _centered(prior, valid, count)
     defined = (spread_x > 0) & (spread_y > 0)
     r = dr.sum(x * y) / dr.select(defined, spread_x * spread_y, 1)
     return dr.select(defined, 1 - r, 0)
 
 
-def environment_total_variation(log_radiance):
+def environment_total_variation(log_radiance: "mi.TensorXf") -> "mi.Float":
     """Total variation of an environment, 1/4π ∫ |∇ log L| dω per radian, summed over channels: each derivative d, along rows
     and columns, counts as √(d² + `_SLOPE`²) − `_SLOPE`: gentle slopes by their square, edges by their height.
 
@@ -235,8 +237,8 @@ def environment_total_variation(log_radiance):
     return dr.sum(total) * (polar * azimuthal / (4 * np.pi))
 
 
-def _centred(x, valid, count):
-    """The ``valid`` lanes of ``x`` less their mean (0 in the others), and the root of the sum of their squares; that is 0
+def _centered(x, valid, count):
+    """The ``valid`` entries of ``x`` less their mean (0 in the others), and the root of the sum of their squares; that is 0
     where the map is constant but for rounding."""
     with dr.suspend_grad():
         base = dr.min(dr.select(valid, x, dr.inf))  # first, so that a sum of many alike numbers loses nothing

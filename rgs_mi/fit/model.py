@@ -30,7 +30,7 @@ _LOG_RADIANCE = (-9.0, 8.0)  # texels that no ray tells apart would else drift t
 _LEAST_SCALE = 1e-6  # world units: smaller surfels overflow on the screen
 
 
-def logit(p, margin=1e-4):
+def logit(p: np.ndarray | float, margin: float = 1e-4) -> np.ndarray:
     """Inverse of the logistic function, for NumPy arrays; ``p`` is kept ``margin`` away from 0 and 1."""
     p = np.clip(p, margin, 1 - margin)
     return np.log(p / (1 - p))
@@ -48,7 +48,7 @@ class Model:
     world frame. ``two_sided``: see `Surfels`.
     """
 
-    def __init__(self, parameters: dict, rotation: np.ndarray, two_sided: bool = True):
+    def __init__(self, parameters: dict, rotation: np.ndarray, two_sided: bool = True) -> None:
         self.rotation, self.two_sided = np.asarray(rotation, np.float64), bool(two_sided)
         self.optimizer = mi.ad.Adam(lr=1e-3, epsilon=_EPSILON)
         for name, value in parameters.items():
@@ -102,10 +102,10 @@ class Model:
             two_sided,
         )
 
-    def __len__(self):
+    def __len__(self) -> int:
         return self.optimizer["centers"].shape[0]
 
-    def __getitem__(self, name):
+    def __getitem__(self, name: str) -> "mi.TensorXf":
         return self.optimizer[name]
 
     def surfels(self, sh_order: int) -> Surfels:
@@ -139,11 +139,11 @@ class Model:
 
     # ---- Surgery ----
 
-    def numpy(self, name) -> np.ndarray:
+    def numpy(self, name: str) -> np.ndarray:
         """One parameter as a NumPy array."""
         return dr.detach(self.optimizer[name]).numpy()
 
-    def set(self, name, value, reset=True):
+    def set(self, name: str, value: np.ndarray, reset: bool = True) -> None:
         """Replace a parameter; its moments start again from zero, or stay where ``reset`` is off (same shape)."""
         moments = self.optimizer.state[name][3]
         del self.optimizer[name]
@@ -151,7 +151,7 @@ class Model:
         if not reset:
             self._set_moments(name, *moments[:3])
 
-    def select(self, index, changes):
+    def select(self, index: np.ndarray, changes: dict[str, np.ndarray]) -> None:
         """Keep the surfels ``index`` (any order, repeats allowed) with their moments, then overwrite parameters by
         ``changes`` {name: array}. Surfels that ``fresh`` marks get zero moments."""
         fresh = changes.pop("fresh", np.zeros(len(index), bool))
@@ -162,7 +162,7 @@ class Model:
             self.set(name, changes.get(name, value[index]))
             self._set_moments(name, t, *map(as_float, moments))
 
-    def refine_environment(self):
+    def refine_environment(self) -> None:
         """Twice as many rows and columns of environment, on which the logarithm of radiance and its moments are as before:
         a texel is a quarter of the old one, and so is its derivative."""
         value = self.optimizer[ENVIRONMENT]

@@ -5,9 +5,14 @@ pyramid, and the pyramids of two views meet in a region of space; density contro
 NumPy's, and nothing here is differentiated.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 from scipy import ndimage
 from skimage import measure
+
+from ..core.camera import Camera
+from ..core.color import to_8bit
 
 _WIDTH = 800  # pixels that a debug picture has at least
 _LINE_WIDTH = 2  # pixels of it
@@ -29,7 +34,7 @@ def reflective_mask(roughness: np.ndarray, alpha: np.ndarray, percentile: float 
 def boxes(mask: np.ndarray, least_pixels: int = 16) -> np.ndarray:
     """B_v: the bounds of the 8-connected components of ``mask`` [H, W] that have at least ``least_pixels`` pixels: an array
     [B, 4] of integers (x0, y0, x1, y1), in pixels, half-open. Boxes of one view may overlap."""
-    components = measure.label(mask, connectivity=2)
+    components = np.asarray(measure.label(mask, connectivity=2))
     pixels = np.bincount(components.ravel())[1:]
     around = [
         (x.start, y.start, x.stop, y.stop)
@@ -39,7 +44,7 @@ def boxes(mask: np.ndarray, least_pixels: int = 16) -> np.ndarray:
     return np.array(around, np.intp).reshape(-1, 4)
 
 
-def guided(centers: np.ndarray, cameras, boxes_per_view) -> np.ndarray:
+def guided(centers: np.ndarray, cameras: Iterable[Camera], boxes_per_view: Iterable[np.ndarray]) -> np.ndarray:
     """The surfels that lie in the meeting of two views' pyramids: [N] bool.
 
     ``centers`` [N, 3]: world space; ``cameras``: a `Camera` a view; ``boxes_per_view``: for each the [B, 4] of `boxes`, in
@@ -52,7 +57,8 @@ def guided(centers: np.ndarray, cameras, boxes_per_view) -> np.ndarray:
     for camera, found in zip(cameras, boxes_per_view, strict=True):
         if len(found):
             undecided = np.flatnonzero(count < 2)
-            count[undecided] += _inside(*camera.project(centers[undecided]), found)
+            pixel, depth = camera.project(centers[undecided])
+            count[undecided] += _inside(pixel, depth, found)
     return count == 2
 
 
@@ -71,7 +77,7 @@ def _inside(pixel, depth, found):
     return inside
 
 
-def picture(image: np.ndarray, mask: np.ndarray, found: np.ndarray, camera, centers: np.ndarray) -> np.ndarray:
+def picture(image: np.ndarray, mask: np.ndarray, found: np.ndarray, camera: Camera, centers: np.ndarray) -> np.ndarray:
     """A view as people can check it: β̂ tinted blue, the boxes in red, the surfels at ``centers`` as yellow dots.
 
     ``image`` [H, W, 3]: display values in [0, 1] of ``camera``'s view, a rendering or the photograph; ``mask`` [H, W] and
@@ -82,11 +88,11 @@ def picture(image: np.ndarray, mask: np.ndarray, found: np.ndarray, camera, cent
     enlarge = lambda v: v.repeat(scale, 0).repeat(scale, 1)
     grey = enlarge(image.mean(-1, keepdims=True))
     tinted = grey + 0.45 * (np.array(TINT) / 255 - grey) * enlarge(mask)[..., None]
-    canvas = np.uint8(np.clip(tinted, 0, 1) * 255 + 0.5)
+    canvas = to_8bit(tinted)
     height, width = canvas.shape[:2]
 
     pixel, depth = camera.project(centers)
-    x, y = np.where(depth > 0, pixel.T * scale, -1)
+    x, y = np.where(depth > 0, pixel.T * scale, -1)[:2]
     seen = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     canvas[y[seen].astype(int), x[seen].astype(int)] = DOT
     for x0, y0, x1, y1 in found * scale:

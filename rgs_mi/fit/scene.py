@@ -1,6 +1,7 @@
 """What there is to fit: a Mitsuba scene whose surfels name photographs, and the YAML beside it that says how."""
 
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,7 +43,7 @@ class FitScene:
     shading: Shading
 
     @classmethod
-    def load(cls, path, data=None, variables=None) -> "FitScene":
+    def load(cls, path: str | Path, data: str | Path | None = None, variables: dict | None = None) -> "FitScene":
         """``data``: the scene's variable of that name, relative to the current folder (`None`: as the scene has it,
         relative to the scene).
 
@@ -72,17 +73,17 @@ class FitScene:
         )
 
     @staticmethod
-    def integrator_element(root):
+    def integrator_element(root: ET.Element) -> ET.Element | None:
         """The element of the integrator in the XML, or None."""
         return root.find("integrator[@type='rgs_deferred']")
 
     @staticmethod
-    def surfels_element(root):
+    def surfels_element(root: ET.Element) -> ET.Element | None:
         """The element of the surfels in the XML, or None."""
         return root.find("shape[@type='surfels']")
 
     @staticmethod
-    def emitter_element(root):
+    def emitter_element(root: ET.Element) -> ET.Element | None:
         """The element of the environment in the XML, or None."""
         return next((e for e in root.findall("emitter") if e.get("type") in _ENVIRONMENTS), None)
 
@@ -94,13 +95,13 @@ class FitScene:
             return self.path.stem
         return given.stem if given.suffix == ".xml" else given.name
 
-    def settings(self, config=None, overrides=()) -> Settings:
+    def settings(self, config: str | Path | None = None, overrides: Sequence[str] = ()) -> Settings:
         """Defaults, then the YAML beside the scene, ``config`` (a preset or file), and ``overrides`` ('a.b=value')."""
         beside = self.path.with_suffix(".yaml")
         sources = [beside.absolute()] if beside.is_file() else []
         return load_config(Settings, [*sources, *([config] if config else [])], overrides)
 
-    def dataset(self, quiet=False) -> Dataset:
+    def dataset(self, quiet: bool = False) -> Dataset:
         """The photographs; those of a scene are path-traced on first use, which takes minutes."""
         folder = self.photographs
         if folder.suffix == ".xml":

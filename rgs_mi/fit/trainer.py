@@ -48,11 +48,14 @@ class Fit:
         self.schedule = Schedule.of(settings, shading)
         self.objective = Objective(settings, extent, shading.box)
         self.density = DensityControl(settings.density, extent, shading.box, len(model))
-        self.curves, self.photographs = Curves(), None
+        self.curves = Curves()
+        self.photographs: Photographs | None = None  # of the stage that has begun
         self.step_number, self.views_used, self.elapsed = 0, 0, 0.0
         self.psnr, self._failures = 0.0, 0
         # Of some steps ago: what reflected rays meet, what surfels hide of the light, and what samples the light
-        self.proxies = self.irradiance_visibility = self.emitter = None
+        self.proxies: Proxies | None = None
+        self.irradiance_visibility: mi.Color3f | None = None
+        self.emitter: mi.Emitter | None = None
 
     # ---- State ----
 
@@ -175,7 +178,7 @@ class Fit:
         leaves = [type(v)(dr.detach(v)) for v in shared]
         dr.eval(leaves)
         dr.enable_grad(leaves)
-        surfels = Surfels(*leaves[: len(CHANNELS)], surfels.two_sided)
+        surfels = Surfels(**dict(zip(CHANNELS, leaves)), two_sided=surfels.two_sided)
         lighting = lighting and lighting.with_learned(leaves[len(CHANNELS) :], surfels)
         measured = [self._view(i, surfels, lighting, 1 / len(views)) for i in views]
         for value, leaf in zip(shared, leaves):
@@ -187,6 +190,7 @@ class Fit:
 
     def _view(self, i, surfels, lighting, weight):
         """Accumulate the gradients of view ``i``; returns its loss's terms and the mean squared ``error``."""
+        assert self.photographs is not None
         photo = self.photographs[i]
         means2d_offset = dr.zeros(mi.Vector2f, len(self.model))
         dr.enable_grad(means2d_offset)

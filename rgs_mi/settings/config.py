@@ -10,10 +10,11 @@ import os
 import re
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import yaml
 from pydantic import TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
 
 from ..core.errors import UserError
 from .fields import expected, fields, section, section_at, walk
@@ -63,7 +64,7 @@ def presets() -> list[str]:
 
 
 def _preset_folder():
-    return resources.files(__package__) / "presets"
+    return resources.files("rgs_mi.settings") / "presets"
 
 
 def _read(source):
@@ -165,7 +166,7 @@ def _merged(cls, tree, data) -> dict:
     return tree
 
 
-def _message(cls, error: dict[str, Any]) -> str:
+def _message(cls, error: ErrorDetails) -> str:
     """One of pydantic's errors in a line."""
     location, value = error["loc"], error["input"]
     if error["type"] == "json_invalid":

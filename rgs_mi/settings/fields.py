@@ -54,8 +54,7 @@ def walk(cls, prefix="") -> Iterator[Setting]:
 
 def section(annotation) -> type | None:
     """The model that ``annotation`` is, or is optionally."""
-    found = [a for a in (annotation, *_alternatives(annotation)) if is_dataclass(a)]
-    return found[0] if found else None
+    return next((a for a in (annotation, *_alternatives(annotation)) if isinstance(a, type) and is_dataclass(a)), None)
 
 
 def expected(cls, location) -> str:
@@ -64,9 +63,10 @@ def expected(cls, location) -> str:
     return ", ".join(filter(None, (kind(found[0]), _range(*_bounds(*found))))) if found else ""
 
 
-def section_at(cls, location) -> type:
-    """The model at ``location`` in the model ``cls``."""
-    return section(_at(cls, location)[0])
+def section_at(cls, location) -> type | None:
+    """The model at ``location`` in the model ``cls``; None where something else stands."""
+    found = _at(cls, location)
+    return section(found[0]) if found else None
 
 
 def _at(annotation, location, metadata=()):

@@ -22,30 +22,35 @@ WeightPair = tuple[Annotated[float, Field(ge=0, le=1e3)], Annotated[float, Field
 class Stage:
     """One level of the coarse-to-fine pyramid."""
 
-    until: float = Field(1.0, ge=0, le=1, description="The stage lasts until this fraction of the fit is done.")
-    downscale: int = Field(1, ge=1, le=64, description="Photographs are this many times smaller.")
-    views: int = Field(1, ge=1, le=256, description="So many views are rendered per step; losses are averaged (MVGS).")
+    until: float = Field(default=1.0, ge=0, le=1, description="The stage lasts until this fraction of the fit is done.")
+    downscale: int = Field(default=1, ge=1, le=64, description="Photographs are this many times smaller.")
+    views: int = Field(
+        default=1, ge=1, le=256, description="So many views are rendered per step; losses are averaged (MVGS)."
+    )
 
 
 @dataclass(frozen=True, config=_MODEL)
 class Initialization:
     """Where the fit begins."""
 
-    surfels: int = Field(25_000, ge=1, le=10_000_000, description="The fit starts with so many surfels.")
+    surfels: int = Field(default=25_000, ge=1, le=10_000_000, description="The fit starts with so many surfels.")
     hull: bool = Field(
-        True,
+        default=True,
         description="Surfels start on the visual hull where photographs have masks, else on the data set's points, or at random.",
     )
-    carve: bool = Field(True, description="The hull is carved first: it loses what photographs look through.")
+    carve: bool = Field(default=True, description="The hull is carved first: it loses what photographs look through.")
     scale: float = Field(
-        0.8, ge=0.01, le=10, description="Standard deviation of a surfel over the distance to its neighbours."
+        default=0.8, ge=0.01, le=10, description="Standard deviation of a surfel over the distance to its neighbours."
     )
     opacity: float | None = Field(
-        None, ge=0.001, le=0.999, description="Opacity of all surfels. Unless given, it is 0.1 at random points, else 0.7."
+        default=None,
+        ge=0.001,
+        le=0.999,
+        description="Opacity of all surfels. Unless given, it is 0.1 at random points, else 0.7.",
     )
-    roughness: float = Field(0.3, ge=0, le=1, description="Roughness of all surfels.")
+    roughness: float = Field(default=0.3, ge=0, le=1, description="Roughness of all surfels.")
     surroundings: int = Field(
-        5_000, ge=0, le=1_000_000, description="So many more surfels lie far away where photographs have no masks."
+        default=5_000, ge=0, le=1_000_000, description="So many more surfels lie far away where photographs have no masks."
     )
 
 
@@ -53,46 +58,50 @@ class Initialization:
 class LearningRates:
     """Adam's learning rates: the first and the last, joined geometrically. Positions are in units of the object."""
 
-    centers: Rates = Field((5e-4, 1e-5), description="Of the positions.")
-    rotations: Rates = Field((2e-3, 2e-4), description="Of the orientations.")
-    scales: Rates = Field((1e-2, 2e-3), description="Of the standard deviations.")
-    opacities: Rates = Field((5e-2, 1e-2), description="Of the opacities.")
-    sh_dc: Rates = Field((1e-2, 1e-3), description="Of the diffuse radiance, its mean over directions.")
-    sh_rest: Rates = Field((1e-3, 1e-4), description="Of the diffuse radiance, what varies with direction.")
-    base_color: Rates = Field((1e-1, 2e-2), description="Of the base colours.")
-    roughness: Rates = Field((1e-1, 2e-2), description="Of the roughness.")
-    metallic: Rates = Field((1e-1, 2e-2), description="Of how metallic surfels are.")
-    delta_normal: Rates = Field((1e-3, 1e-4), description="Of the normals' residuals (RGS, Δn).")
-    curvature: Rates = Field((2e-3, 2e-4), description="Of the curvatures; 0 leaves every surfel one normal.")
-    environment: Rates = Field((6e-2, 5e-3), description="Of the environment's texels.")
-    shader: Rates = Field((1e-2, 1e-3), description="Of the network of `shader`.")
+    centers: Rates = Field(default=(5e-4, 1e-5), description="Of the positions.")
+    rotations: Rates = Field(default=(2e-3, 2e-4), description="Of the orientations.")
+    scales: Rates = Field(default=(1e-2, 2e-3), description="Of the standard deviations.")
+    opacities: Rates = Field(default=(5e-2, 1e-2), description="Of the opacities.")
+    sh_dc: Rates = Field(default=(1e-2, 1e-3), description="Of the diffuse radiance, its mean over directions.")
+    sh_rest: Rates = Field(default=(1e-3, 1e-4), description="Of the diffuse radiance, what varies with direction.")
+    base_color: Rates = Field(default=(1e-1, 2e-2), description="Of the base colours.")
+    roughness: Rates = Field(default=(1e-1, 2e-2), description="Of the roughness.")
+    metallic: Rates = Field(default=(1e-1, 2e-2), description="Of how metallic surfels are.")
+    delta_normal: Rates = Field(default=(1e-3, 1e-4), description="Of the normals' residuals (RGS, Δn).")
+    curvature: Rates = Field(default=(2e-3, 2e-4), description="Of the curvatures; 0 leaves every surfel one normal.")
+    environment: Rates = Field(default=(6e-2, 5e-3), description="Of the environment's texels.")
+    shader: Rates = Field(default=(1e-2, 1e-3), description="Of the network of `shader`.")
 
 
 @dataclass(frozen=True, config=_MODEL)
 class Weights:
     """Weights of the losses."""
 
-    dssim: float = Field(0.2, ge=0, le=1, description="D-SSIM has this weight against L1.")
-    mask: float = Field(0.1, ge=0, le=1e3, description="Difference of opacity and mask.")
+    dssim: float = Field(default=0.2, ge=0, le=1, description="D-SSIM has this weight against L1.")
+    mask: float = Field(default=0.1, ge=0, le=1e3, description="Difference of opacity and mask.")
     consistency: WeightPair = Field(
-        (0.05, 0.6),
+        default=(0.05, 0.6),
         description="Depth-normal consistency (2DGS), first and last, joined geometrically: early it would hold surfaces back.",
     )
-    distortion: float = Field(0.0, ge=0, le=1e6, description="Distance of the surfels along a ray from each other (2DGS).")
-    normal: float = Field(0.1, ge=0, le=1e3, description="Smoothness of the normals of what is reflective (RGS, L_normal).")
+    distortion: float = Field(
+        default=0.0, ge=0, le=1e6, description="Distance of the surfels along a ray from each other (2DGS)."
+    )
+    normal: float = Field(
+        default=0.1, ge=0, le=1e3, description="Smoothness of the normals of what is reflective (RGS, L_normal)."
+    )
     crease: float = Field(
-        0.1,
+        default=0.1,
         ge=0,
         le=1e3,
         description="`normal` lets differences of unit normals from pixel to pixel be that are larger than this; 0 lets none be.",
     )
     minimum_variation: float = Field(
-        30.0, ge=0, le=1e6, description="Change of curvature where what is reflective is smooth."
+        default=30.0, ge=0, le=1e6, description="Change of curvature where what is reflective is smooth."
     )
-    delta_normal: float = Field(0.0, ge=0, le=1e3, description="Length of the normals' residuals (RGS, L_Δn).")
-    depth: float = Field(1e-3, ge=0, le=1e3, description="Correlation with the depth prior (RGS, L_depth).")
+    delta_normal: float = Field(default=0.0, ge=0, le=1e3, description="Length of the normals' residuals (RGS, L_Δn).")
+    depth: float = Field(default=1e-3, ge=0, le=1e3, description="Correlation with the depth prior (RGS, L_depth).")
     environment_tv: float = Field(
-        1e-5,
+        default=1e-5,
         ge=0,
         le=1e3,
         description="Total variation of the environment: what nothing reflects sharply stays smooth.",
@@ -104,7 +113,7 @@ class Prior:
     """Where the depth prior of the photographs comes from."""
 
     name: Literal["hull", "stereo", "files", "vggt", "none"] = Field(
-        "none", description="What estimates depth (`rgs_mi.priors`)."
+        default="none", description="What estimates depth (`rgs_mi.priors`)."
     )
     options: dict[str, Any] = Field(default_factory=dict, description="Options of the prior's function.")
 
@@ -113,27 +122,29 @@ class Prior:
 class Density:
     """Adaptive density control (2DGS)."""
 
-    start: float = Field(0.08, ge=0, le=1, description="Fraction of the fit from which surfels are cloned and split.")
-    stop: float = Field(0.6, ge=0, le=1, description="Fraction of the fit after which they no longer are.")
-    refine_every: int = Field(100, ge=1, le=100_000, description="Steps from one time to the next.")
+    start: float = Field(
+        default=0.08, ge=0, le=1, description="Fraction of the fit from which surfels are cloned and split."
+    )
+    stop: float = Field(default=0.6, ge=0, le=1, description="Fraction of the fit after which they no longer are.")
+    refine_every: int = Field(default=100, ge=1, le=100_000, description="Steps from one time to the next.")
     grow_grad2d: float = Field(
-        1e-4,
+        default=1e-4,
         ge=0,
         le=1,
         description="Positional gradient, in NDC units, above which surfels grow; half of 2DGS's: rather many surfels.",
     )
     grow_scale3d: float = Field(
-        0.01, ge=0, le=1, description="Surfels smaller than this, in units of the object, are cloned, others split."
+        default=0.01, ge=0, le=1, description="Surfels smaller than this, in units of the object, are cloned, others split."
     )
-    prune_opacity: float = Field(0.05, ge=0, le=1, description="Surfels of less opacity are removed.")
+    prune_opacity: float = Field(default=0.05, ge=0, le=1, description="Surfels of less opacity are removed.")
     max_surfels: int | None = Field(
-        None,
+        default=None,
         ge=1,
         le=10_000_000,
         description=f"Never more surfels than this; unless given, {_SURFELS}, or {_SURFELS_A_MINUTE} a minute if more.",
     )
     guided: bool = Field(
-        False,
+        default=False,
         description="The threshold is halved where two views or more see something reflective (RGS, Algorithm 1).",
     )
 
@@ -143,65 +154,74 @@ class Settings:
     """All settings. ``iterations``, or else ``minutes``, bound the fit."""
 
     minutes: float | None = Field(
-        8.0, ge=0.01, le=100_000, description="The fit is planned to end within this time, which `--minutes` sets."
+        default=8.0, ge=0.01, le=100_000, description="The fit is planned to end within this time, which `--minutes` sets."
     )
     iterations: int | None = Field(
-        None, ge=1, le=10_000_000, description="The fit takes so many steps, however long that is, instead of `minutes`."
+        default=None,
+        ge=1,
+        le=10_000_000,
+        description="The fit takes so many steps, however long that is, instead of `minutes`.",
     )
-    seed: int = Field(0, ge=0, le=2**31, description="Seed of everything random.")
+    seed: int = Field(default=0, ge=0, le=2**31, description="Seed of everything random.")
     spp: int = Field(
-        4,
+        default=4,
         ge=1,
         le=64,
         description="Samples per pixel of what a fit leaves behind, on a grid; its steps take one.",
     )
     background: float = Field(
-        1.0, ge=0, le=1, description="Display grey level behind masked objects, in training and in figures."
+        default=1.0, ge=0, le=1, description="Display grey level behind masked objects, in training and in figures."
     )
     specular_start: float = Field(
-        0.0, ge=0, le=1, description="Fraction of the fit from which reflections are shaded; 1 means never."
+        default=0.0, ge=0, le=1, description="Fraction of the fit from which reflections are shaded; 1 means never."
     )
     normals_start: float = Field(
-        0.2,
+        default=0.2,
         ge=0,
         le=1,
         description="Fraction of the fit from which normals that start on the hull move at their rates; before, at a tenth.",
     )
-    cooldown: float = Field(0.05, ge=0, le=1, description="The last fraction of the fit, in which all rates fall to zero.")
+    cooldown: float = Field(
+        default=0.05, ge=0, le=1, description="The last fraction of the fit, in which all rates fall to zero."
+    )
     box: tuple[float, float, float, float, float, float] | None = Field(
-        None,
+        default=None,
         description="Lower and upper corner of the box around the object, in captures without masks: what reflects. Unless "
         "given, it is half as far from the point that the cameras look at as the nearest of them.",
     )
     reflective: float = Field(
-        0.9, ge=0, le=1, description="The fraction of a view's foreground, smoothest first, that is reflective."
+        default=0.9, ge=0, le=1, description="The fraction of a view's foreground, smoothest first, that is reflective."
     )
     refine_start: float = Field(
-        0.5,
+        default=0.5,
         ge=0,
         le=1,
         description="Fraction of the fit from which a learned environment has the rows that photographs tell apart, by "
         "doubling, up to 512.",
     )
     shader: Literal["identity", "mlp"] = Field(
-        "identity", description="f_φ of C = C_d + f_φ(C_s): nothing, or a tiny network trained along."
+        default="identity", description="f_φ of C = C_d + f_φ(C_s): nothing, or a tiny network trained along."
     )
     indirect: Literal["none", "visibility", "one_bounce"] = Field(
-        "one_bounce", description="What reflected rays that meet surfels bring."
+        default="one_bounce", description="What reflected rays that meet surfels bring."
     )
-    indirect_start: float = Field(0.1, ge=0, le=1, description="Fraction of the fit from which those rays are traced.")
+    indirect_start: float = Field(
+        default=0.1, ge=0, le=1, description="Fraction of the fit from which those rays are traced."
+    )
     monte_carlo_start: float = Field(
-        0.8,
+        default=0.8,
         ge=0,
         le=1,
         description="Fraction of the fit from which `monte_carlo` takes over from `split_sum` where the integrator asks for it.",
     )
-    monte_carlo_samples: int = Field(4, ge=1, le=4096, description="Samples a pixel of `monte_carlo`.")
-    sh_order: int = Field(2, ge=0, le=3, description="Order of the spherical harmonics of the diffuse radiance.")
-    sh_start: float = Field(0.4, ge=0, le=1, description="Fraction of the fit from which view-dependent diffuse is learned.")
-    checkpoint_seconds: float = Field(20.0, ge=0, le=1e6, description="Seconds from one checkpoint to the next.")
+    monte_carlo_samples: int = Field(default=4, ge=1, le=4096, description="Samples a pixel of `monte_carlo`.")
+    sh_order: int = Field(default=2, ge=0, le=3, description="Order of the spherical harmonics of the diffuse radiance.")
+    sh_start: float = Field(
+        default=0.4, ge=0, le=1, description="Fraction of the fit from which view-dependent diffuse is learned."
+    )
+    checkpoint_seconds: float = Field(default=20.0, ge=0, le=1e6, description="Seconds from one checkpoint to the next.")
     stages: tuple[Stage, ...] = Field(
-        (Stage(0.2, 2, 1), Stage(1.0, 1, 1)),
+        default=(Stage(0.2, 2, 1), Stage(1.0, 1, 1)),
         description="The coarse-to-fine pyramid, a mapping of `until`, `downscale` and `views` for each level.",
     )
     initialization: Initialization = Initialization()

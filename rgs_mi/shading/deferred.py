@@ -27,7 +27,7 @@ class Shading:
     """How a scene is shaded, as the parameters of its integrator `rgs_deferred` say; ``eta`` is the surfels' index of
     refraction, and ``box`` says where all this holds (None: everywhere)."""
 
-    specular: Literal["none", "split_sum", "monte_carlo"] = "split_sum"
+    specular: Literal["split_sum", "monte_carlo", "none"] = "split_sum"
     diffuse: Literal["radiance", "lit"] = "radiance"
     samples: int = SAMPLES
     eta: float = DEFAULT_ETA

@@ -16,7 +16,7 @@ from .split_sum import SplitSum
 def lighting_of(
     shading: Shading,
     surfels: Surfels,
-    environment: FilteredEnvironment,
+    environment: FilteredEnvironment | None,
     emitter: "mi.Emitter | None" = None,
     shader: Shader | None = None,
     seed: int = 0,
@@ -27,7 +27,7 @@ def lighting_of(
     """The `Lighting` of ``surfels`` that are shaded as ``shading`` says; None where it says that nothing is specular.
 
     Args:
-      environment: filtered for ``split_sum``, unfiltered for ``monte_carlo``
+      environment: None only where nothing is specular; filtered for ``split_sum``, unfiltered for ``monte_carlo``
       emitter: Mitsuba's, whose sampling ``monte_carlo`` uses
       shader:  f_φ; None is the identity
       seed:    of what is random: samples of ``monte_carlo``, rays of irradiance visibility
@@ -37,6 +37,7 @@ def lighting_of(
     """
     if shading.specular == "none":
         return None
+    assert environment is not None
     lit, sampled = shading.diffuse == "lit", shading.specular == "monte_carlo"
     estimator = SplitSum(environment, shading.eta)
     if sampled:

@@ -9,15 +9,13 @@ import re
 from pathlib import Path
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyParseError
 
 from ..core.errors import UserError
-from ..core.files import atomic_file
+from ..core.ply_format import read_vertices, write_vertices
 
 _THICKNESS = 1e-3  # of the smaller scale: what a 3DGS viewer, which draws ellipsoids, gets as the third
 _TINY = np.finfo(np.float32).tiny
 _OPACITY = (1e-7, 1 - 2.0**-24)  # the open interval (0, 1) in float32
-_HEADER_LIMIT = 1 << 20
 _REMEDY = "give a PLY of surfels, from 2DGS, 3DGS or rgs_mi"
 
 # field -> properties in the field's order; the material's with their defaults
@@ -68,8 +66,7 @@ def write_ply(path, fields: dict[str, np.ndarray]):
     }
     table = np.concatenate(list(columns.values()), 1, dtype=np.float32)
     vertices = table.view([(name, "f4") for names in columns for name in names])[:, 0]
-    with atomic_file(path) as stream:
-        PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(stream)
+    write_vertices(path, vertices)
 
 
 def read_ply(path) -> dict[str, np.ndarray]:
@@ -115,31 +112,14 @@ def read_ply(path) -> dict[str, np.ndarray]:
 
 
 def _read_vertices(path):
-    """The vertices as a structured array; refuses what would make the parser allocate more than the file holds."""
+    """The vertices as a structured array."""
     try:
-        with open(path, "rb") as stream:
-            header = stream.read(_HEADER_LIMIT).partition(b"end_header")[0]
-        size = path.stat().st_size
-        if not header.startswith(b"ply"):
-            raise UserError(f"{path}: not a PLY file (its first line must be 'ply'): check the path")
-        for name, count in re.findall(rb"[\r\n]element\s+(\S+)\s+(-?\d+)", header):
-            if not 0 <= int(count) <= size:
-                raise UserError(
-                    f"{path}: declares {int(count)} elements '{name.decode('ascii', 'replace')}' in {size} "
-                    "bytes: the file is damaged, export it again"
-                )
-        if re.search(rb"[\r\n]property\s+list\b", header):
-            raise UserError(f"{path}: has list properties, as a mesh does: {_REMEDY}")
-        ply = PlyData.read(str(path))
-        vertices = ply["vertex"].data if "vertex" in ply else ()
+        return read_vertices(path)
     except OSError as error:
         raise UserError(f"{path}: can't be read ({error.strerror or error}): check the path") from error
-    except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"{path}: damaged PLY ({reason}): copy or export it again") from error
-    if not len(vertices):
-        raise UserError(f"{path}: holds no vertices: export it again")
-    return vertices
+    except (ValueError, OverflowError, MemoryError) as error:
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise UserError(f"{path}: not a PLY of surfels, or damaged ({reason}): {_REMEDY}") from error
 
 
 def _columns(path, vertices, names):

@@ -7,7 +7,8 @@ differs is the shading alone. A *case* is a shape of one material in an environm
   interreflection adds; both are sampled in independent batches, whose spread gives the standard error of each pixel;
 - `monte_carlo`, in batches as well, must be equal to it: by the Z-test of `mitsuba.testing`, pixel by pixel, and over all
   pixels together, where a small bias that no pixel shows adds up;
-- `split_sum` has an error of its own, Σ|difference| / Σ truth over all pixels, which is bounded.
+- `split_sum` has an error of its own, Σ|difference| / Σ truth over all pixels, whose bound on a sphere is the case's own
+  (`bounds`).
 """
 
 import itertools
@@ -25,13 +26,12 @@ from ..shading.environment import Environment
 from ..shading.monte_carlo import MonteCarlo
 from ..shading.split_sum import DEFAULT_ETA, SplitSum
 from ..targets import environments as _suite
+from .bounds import ROUGHNESS, bound
 from .statistics import GLOBAL, SUCCESS, Difference, Estimate
 
-ROUGHNESS = (0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0)
 METALS = ((0.95, 0.95, 0.95), (0.9, 0.6, 0.2))
 DIELECTRICS = ((0.0, 0.0, 0.0), (0.8, 0.8, 0.8), (0.1, 0.3, 0.7))  # without a diffuse lobe, and with one
 ENVIRONMENTS = ("studio", "kitchen", "city")
-BOUNDS = {"metal": 0.02, "dielectric": 0.03}  # of split_sum's error on a sphere
 BATCHES = 16
 _ENVIRONMENT_HEIGHT = 256
 _DEEP = 8
@@ -50,16 +50,12 @@ class Case:
     @property
     def material(self) -> str:
         """In words."""
-        return f"{self.kind} {'/'.join(f'{c:g}' for c in self.base_color)}"
+        return f"{'metal' if self.metallic else 'dielectric'} {'/'.join(f'{c:g}' for c in self.base_color)}"
 
     @property
     def name(self) -> str:
         """For files."""
         return f"{self.shape}_{self.environment}_{self.material}_{self.roughness:g}".replace(" ", "_").replace("/", "-")
-
-    @property
-    def kind(self):
-        return "metal" if self.metallic else "dielectric"
 
     @property
     def lit(self):
@@ -117,6 +113,12 @@ class Result:
         return float(np.sqrt(2 / np.pi) * spread.sum() / self.path.mean.sum())
 
     @property
+    def bound(self) -> float | None:
+        """Of `error`: the case's own, and what noise adds."""
+        own = bound(self.case.shape, self.case.environment, self.case.material, self.case.roughness)
+        return None if own is None else own + self.noise
+
+    @property
     def truth(self):
         """The best estimate of the integral: both together, weighted by their variances over all pixels."""
         a, b = self._weights()
@@ -138,8 +140,8 @@ class Result:
             found.append(f"monte_carlo differs from path in {1 - self.difference.passed:.1%} of the pixels")
         if self.difference.global_z > GLOBAL:
             found.append(f"monte_carlo differs from path by {self.difference.global_z:.1f} standard errors over all pixels")
-        if self.case.shape == "sphere" and self.error > BOUNDS[self.case.kind]:
-            found.append(f"split_sum is off by {self.error:.2%} (bound: {BOUNDS[self.case.kind]:.0%})")
+        if self.bound is not None and self.error > self.bound:
+            found.append(f"split_sum is off by {self.error:.2%} (bound: {self.bound:.2%})")
         return found
 
     def picture(self, values) -> np.ndarray:

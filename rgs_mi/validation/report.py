@@ -16,7 +16,6 @@ from ..core.progress import Progress
 from ..report import html
 from ..report.plots import curves
 from ..report.tables import csv_text
-from .cases import BOUNDS
 from .checks import checks
 
 
@@ -58,6 +57,7 @@ def _row(r) -> dict:
         "z_passed": f"{r.difference.passed:.4f}",
         "z_of_sums": f"{r.difference.global_z:.2f}",
         "split_sum_error": f"{r.error:.4f}",
+        "bound": "" if r.bound is None else f"{r.bound:.4f}",
         "noise": f"{r.noise:.4f}",
         "interreflection": f"{r.interreflection:+.4f}",
         "verdict": "; ".join(r.failures()) or "passes",
@@ -81,7 +81,6 @@ def _html(results, rows, found) -> bytes:
         columns=list(rows[0]),
         cases=[list(row.values()) for row in rows],
         bad_cases=[k for k, row in enumerate(rows) if row["verdict"] != "passes"],
-        over_bound=any(r.case.shape == "sphere" and r.error > BOUNDS[r.case.kind] for r in results),
         checks=[(c.name, f"{c.value:.4g}", f"{c.bound:g}") for c in found],
         bad_checks=[k for k, c in enumerate(found) if not c.passed],
         pictures=[_picture(*key, list(group)) for key, group in itertools.groupby(results, _what)],
@@ -94,7 +93,7 @@ def _plot(results) -> str | None:
     for r in results:
         series.setdefault(r.case.material, {}).setdefault(r.case.roughness, []).append(100 * r.error)
     series = {name: (sorted(values), [np.mean(values[x]) for x in sorted(values)]) for name, values in series.items()}
-    return curves(series, "roughness", "%", {kind: 100 * b for kind, b in BOUNDS.items()}) if series else None
+    return curves(series, "roughness", "%") if series else None
 
 
 def _what(r):

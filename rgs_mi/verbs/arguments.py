@@ -41,7 +41,7 @@ def add_integer(parser, name, default, text):
     parser.add_argument(name, type=int, default=default, help=f"{text} (default: %(default)s)".strip())
 
 
-def add_names(parser, name, text, kind=str, metavar="A,B", **options):
+def add_names(parser, name, text, kind: type = str, metavar="A,B", **options):
     parser.add_argument(name, type=listed(kind), metavar=metavar, help=text, **options)
 
 

@@ -197,15 +197,36 @@ def test_full_disk_does_not_end_the_fit(inputs, tmp_path, monkeypatch):
     assert metrics(tmp_path)["iterations"] == 20
 
 
-def test_divergence_keeps_the_last_checkpoint(inputs, tmp_path, monkeypatch):
+@pytest.mark.parametrize("failures", [1, 9, 10])
+def test_divergence_keeps_the_last_checkpoint(inputs, tmp_path, monkeypatch, failures):
+    """Ten steps in a row without a finite error; nine are forgiven, and no other numbers reach a checkpoint."""
+    view = Fit._view
+
+    def overflow(self, *arguments):
+        broken = 5 <= self.step_number < 5 + failures
+        return view(self, *arguments) | ({"error": mi.Float(np.nan)} if broken else {})
+
+    monkeypatch.setattr(Fit, "_view", overflow)
+    if failures < 10:
+        fit(*inputs, tmp_path)
+        assert metrics(tmp_path)["iterations"] == 20
+        return
+    with pytest.raises(UserError, match="diverged at step 15 .* go on with --resume and lower rates"):
+        fit(*inputs, tmp_path)
+    arrays, meta = checkpoint.load_latest(tmp_path)
+    assert meta["step"] == 14 and all(np.isfinite(array).all() for array in arrays.values())
+    assert not (tmp_path / "metrics.json").exists()
+
+
+def test_numbers_that_are_not_finite_do_not_replace_a_checkpoint(inputs, tmp_path, monkeypatch):
     step = Fit.step
 
-    def diverge(self):
+    def break_model(self):
         step(self)
         if self.step_number == 5:
-            self.psnr = float("nan")
+            self.model.set("centers", np.full_like(self.model.numpy("centers"), np.nan))
 
-    monkeypatch.setattr(Fit, "step", diverge)
+    monkeypatch.setattr(Fit, "step", break_model)
     with pytest.raises(UserError, match="diverged at step 5"):
         fit(*inputs, tmp_path)
     assert checkpoint.load_latest(tmp_path)[1]["step"] == 4

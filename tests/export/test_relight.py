@@ -169,18 +169,32 @@ def test_bad_environment_maps(run, tmp_path):
             render_scene(run, out=tmp_path / "a.png", envmap=tmp_path / name, quiet=True)
 
 
+#: Figures of a recovery and the largest that a fit may have. Measured for two seeds, and for a start without a fit:
+#: metallic 0.30 and 0.30 (0.60), light 0.38 and 0.37 (0.73), the error under another light 0.100 and 0.103 (0.164).
+RECOVERED = {"metallic_mae": 0.42, "environment_log_rmse": 0.52, "relit_rmse": 0.13}
+
+
 def test_recovery(run, inputs, tmp_path, monkeypatch):
-    """Of the ball, whose light and material the fit comes close to; the figures are those that are written."""
+    """Of the ball: a fit comes closer to light and material than its start is; the figures are those that are written."""
+    from rgs_mi.commands.optimize import optimize
+
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ball.xml").write_text(
         TARGET.replace(
             '<scene version="3.0.0">', '<scene version="3.0.0"><default name="environment" value="studio"/>'
         ).replace('value="studio"/> <i', 'value="$environment"/> <i')
     )
-    figures = recovery(run, tmp_path / "ball.xml", ["kitchen"], size=32, quiet=True)
-    assert figures == json.loads((run / "recovery" / "recovery.json").read_text())
-    assert figures["roughness_mae"] < 0.2 and figures["metallic_mae"] < 0.6 and figures["base_color_mae"] < 0.3
-    assert figures["environment_log_rmse"] < 0.5 and figures["relit"]["kitchen"]["psnr"] > 15
+    scene, data = inputs
+    overrides = [*SETTINGS, "iterations=1"]
+    start = optimize(scene, data=data, out=tmp_path / "run", overrides=overrides, quiet=True, variables={"diffuse": "lit"})
+
+    def within(folder):
+        figures = recovery(folder, tmp_path / "ball.xml", ["kitchen"], size=32, quiet=True)
+        assert figures == json.loads((folder / "recovery" / "recovery.json").read_text())
+        figures["relit_rmse"] = 10 ** (-figures["relit"]["kitchen"]["psnr"] / 20)
+        return {name: figures[name] < most for name, most in RECOVERED.items()}
+
+    assert within(run) == dict.fromkeys(RECOVERED, True) and within(start) == dict.fromkeys(RECOVERED, False)
     assert (run / "recovery" / "relit_kitchen.png").is_file()
 
 

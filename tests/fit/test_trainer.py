@@ -200,9 +200,40 @@ def test_resume_goes_on_where_it_stopped(dataset):
     for _ in range(6):
         again.step()
     assert again.step_number == 12 and again.views_used == 12
-    # atomic additions round differently from run to run, and Adam's first steps amplify it
-    assert np.abs(again.model.numpy("centers") - whole.model.numpy("centers")).max() < 2e-3
-    assert again.psnr == pytest.approx(whole.psnr, abs=0.1)
+    # Atomic additions round differently from run to run. Measured, the largest of eight pairs: 1.2e-7, 6e-6, 6e-6 and 1e-6 dB;
+    # without the moments, or with views from the beginning, 6e-4, 0.07, 0.07 and 0.1 dB.
+    for name, tolerance in (("centers", 5e-6), ("logit_opacities", 3e-4), ("log_environment", 3e-4)):
+        np.testing.assert_allclose(again.model.numpy(name), whole.model.numpy(name), rtol=0, atol=tolerance, err_msg=name)
+    assert again.psnr == pytest.approx(whole.psnr, abs=1e-3)
+
+
+def test_a_view_that_overflows_does_not_end_a_fit(dataset):
+    """One of six has a pixel that is not a number, which reaches all gradients: they are dropped, and all else is kept."""
+    linear = dataset.train[2].pixels.astype(np.float32) / 255
+    linear[37, 41, 0] = np.nan
+    views = [replace(view, pixels=linear) if k == 2 else view for k, view in enumerate(dataset.train)]
+    density = Density(start=0.0, stop=1.0, refine_every=10)
+    fit = Fit(replace(dataset, train=views), model(), replace(SETTINGS, density=density), 1.0)
+    errors = []
+    while fit.progress < 1:
+        fit.step()
+        errors.append(fit.psnr)
+        gradients = fit.density.gradients
+        assert np.isfinite(gradients.sum.numpy()).all() and np.isfinite(gradients.count.numpy()).all()
+    assert np.isfinite(errors).all() and errors[-1] > errors[0] + 2
+    assert all(np.isfinite(array).all() for array in fit.state()[0].values())
+
+
+def test_ten_overflows_in_a_row_do(dataset, monkeypatch):
+    fit, errors = Fit(dataset, model(), SETTINGS, 1.0), []
+    broken, view = {*range(2, 11), *range(12, 22)}, Fit._view
+    nan = lambda fit: {"error": mi.Float(np.nan)} if fit.step_number in broken else {}
+    monkeypatch.setattr(Fit, "_view", lambda self, *arguments: view(self, *arguments) | nan(self))
+    for _ in range(23):
+        fit.step()
+        errors.append(fit.psnr)
+    assert np.isfinite(errors[:21]).all() and np.isnan(errors[21]) and np.isfinite(errors[22])
+    assert len(set(errors[1:11])) == 1  # the last that was a number
 
 
 def test_progress_and_bands_of_harmonics(dataset):

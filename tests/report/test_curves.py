@@ -48,8 +48,6 @@ def test_curves_survive_a_checkpoint(inputs):
     again = Fit.resume(dataset, scene.settings(None, [*SMALL, "iterations=600"]), arrays, json.loads(json.dumps(meta)))
     assert again.step() and [row["step"] for row in again.curves.rows] == [1, 2]
     assert [row["step"] for row in fit.curves.rows] == [1]
-    del meta["curves"]  # as version 0.1.0 wrote them
-    assert Fit.resume(dataset, settings, arrays, meta).curves.rows == []
 
 
 # ---- Plots ----
