@@ -2,7 +2,7 @@
 ``mi.render``."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mitsuba as mi
@@ -30,7 +30,7 @@ AOVS = ("albedo", "roughness", "metallic", "sh_normal", "depth", "diffuse", "spe
 def render_scene(
     path: str | Path,
     *,
-    variables: dict[str, str] | None = None,
+    variables: Mapping[str, object] | None = None,
     view: str | None = None,
     turntable: int | None = None,
     along: int | None = None,

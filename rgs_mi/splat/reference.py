@@ -1,7 +1,7 @@
 """The splatter's slow, readable twin: every surfel against every pixel. The oracle of the tests.
 
 It shares no formula with the tiled one: rays are intersected with planes in world space, nothing is projected but the
-center, no lists are formed, and Dr.Jit differentiates it. So it also goes from pixels to rays by formulas of its own, not by
+center, no lists are formed, and Dr.Jit differentiates it. So it also goes from pixels to rays in NumPy, not by
 `core.camera.pixel_rays`. For scenes of some hundred surfels: all pairs are in memory.
 """
 
