@@ -11,7 +11,6 @@ lights. What `rgs-mi recovery` calls.
     relit                   name -> mean psnr and ssim of the fit under that light, as it is
 """
 
-import json
 from pathlib import Path
 
 import drjit as dr
@@ -19,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import as_float
-from ..core.files import atomic_file, write_png
+from ..core.files import write_png
 from ..core.runtime import cache_folder
 from ..core.scene_files import load_scene, spp_of
 from ..datasets import load_dataset
@@ -55,16 +54,17 @@ def recovery(run, truth, lights=(), *, size=400, out=None, quiet=False) -> dict:
     scene, true_scene = load_scene(path, {}), load_scene(truth, {})
     surfels_of(scene, path)
     own = _views(truth, {}, size, quiet)
-    figures, relit_scores = _materials(scene, path, own), {}
+    figures: dict = _materials(scene, path, own)
+    relit_scores = {}
     figures["environment_log_rmse"] = _environment(scene, true_scene, own)
     for light in lights:
         views = _views(truth, {"environment": light}, size, quiet)
         relit = load_scene(path, {})
         relight(relit, path, light)
         relit_scores[light] = _compare(relit, views, out / f"relit_{light}.png")
-    with atomic_file(out / RECOVERY) as stream:
-        stream.write((json.dumps(figures | {"relit": relit_scores}, indent=1) + "\n").encode())
-    return figures | {"relit": relit_scores}
+    figures["relit"] = relit_scores
+    write_json(out / RECOVERY, figures)
+    return figures
 
 
 def _views(truth, variables, size, quiet):

@@ -1,16 +1,20 @@
 """Files that are there whole or not at all: a reader never sees half of one."""
 
 import errno
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
 from .color import to_8bit
 from .errors import UserError
+
+if TYPE_CHECKING:
+    import mitsuba as mi
 
 
 @contextmanager
@@ -80,11 +84,29 @@ def write_exr(path: str | Path, pixels: np.ndarray, channels: list[str] | None =
 
     formats = mi.Bitmap.PixelFormat
     pixels = np.ascontiguousarray(pixels, np.float32)
-    bitmap = mi.Bitmap(pixels, formats.MultiChannel, channels) if channels else mi.Bitmap(pixels, formats.RGB)
-    memory = mi.MemoryStream()
-    bitmap.write(memory, mi.Bitmap.FileFormat.OpenEXR)
+    write_bitmap(path, mi.Bitmap(pixels, formats.MultiChannel, channels) if channels else mi.Bitmap(pixels, formats.RGB))
+
+
+def write_bitmap(path: str | Path, bitmap: "mi.Bitmap") -> None:
+    """Write a Mitsuba bitmap as an EXR or PNG, as the name says, whole or not at all.
+
+    Raises: UserError as `atomic_file` does.
+    """
+    import mitsuba as mi
+
+    formats, memory = mi.Bitmap.FileFormat, mi.MemoryStream()
+    bitmap.write(memory, formats.OpenEXR if Path(path).suffix == ".exr" else formats.PNG)
     with atomic_file(path) as stream:
         stream.write(memory.raw_buffer())
+
+
+def write_json(path: str | Path, data: dict) -> None:
+    """Write ``data`` as JSON, whole or not at all; what JSON does not know is written as its text.
+
+    Raises: UserError as `atomic_file` does.
+    """
+    with atomic_file(path) as stream:
+        stream.write((json.dumps(data, indent=1, default=str) + "\n").encode())
 
 
 def _sync_folder(folder):

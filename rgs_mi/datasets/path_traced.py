@@ -18,7 +18,6 @@ import hashlib
 import importlib.util
 import json
 import math
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -29,6 +28,7 @@ import numpy as np
 from ..core.camera import Camera, opaque, pixel_directions
 from ..core.color import srgb_encode, to_8bit
 from ..core.errors import UserError
+from ..core.files import write_bitmap, write_json
 from ..core.progress import Progress
 from ..core.scene_files import load_scene
 
@@ -158,18 +158,6 @@ class Renderer:
         return maps.reshape(height, width, -1)
 
 
-def _write(path: Path, bitmap):
-    """Write a bitmap so that ``path`` is there whole or not at all."""
-    temporary = path.with_name(f".{path.stem}.tmp{path.suffix}")
-    try:
-        bitmap.write(str(temporary))
-        os.replace(temporary, path)
-    except (OSError, RuntimeError) as error:
-        temporary.unlink(missing_ok=True)
-        reason = str(error).splitlines()[-1]
-        raise UserError(f"cannot write {path}: {reason}: free some space or choose another folder") from error
-
-
 def _write_view(stem: Path, rgba: np.ndarray, aov: np.ndarray):
     """The files of one view; the photograph last, since its presence means that the view is complete."""
     import mitsuba as mi
@@ -179,10 +167,10 @@ def _write_view(stem: Path, rgba: np.ndarray, aov: np.ndarray):
     half, formats = mi.Struct.Type.Float16, mi.Bitmap.PixelFormat
     encoded = to_8bit(np.concatenate([aov[..., 1:4] * 0.5 + 0.5, aov[..., 9:]], -1)) * (aov[..., 9:] > 0)
     photograph = to_8bit(np.concatenate([srgb_encode(np.clip(straight, 0, 1)), alpha], -1))
-    _write(stem.with_name(stem.name + "_aov.exr"), mi.Bitmap(aov, formats.MultiChannel, list(AOV_CHANNELS)))
-    _write(stem.with_name(stem.name + "_normal.png"), mi.Bitmap(encoded, formats.RGBA))
-    _write(stem.with_suffix(".exr"), mi.Bitmap(rgba, formats.RGBA).convert(component_format=half))
-    _write(stem.with_suffix(".png"), mi.Bitmap(photograph, formats.RGBA))
+    write_bitmap(stem.with_name(stem.name + "_aov.exr"), mi.Bitmap(aov, formats.MultiChannel, list(AOV_CHANNELS)))
+    write_bitmap(stem.with_name(stem.name + "_normal.png"), mi.Bitmap(encoded, formats.RGBA))
+    write_bitmap(stem.with_suffix(".exr"), mi.Bitmap(rgba, formats.RGBA).convert(component_format=half))
+    write_bitmap(stem.with_suffix(".png"), mi.Bitmap(photograph, formats.RGBA))
 
 
 # ---- The data set ----
@@ -241,17 +229,8 @@ def _prepare(out: Path, key: dict) -> bool:
             (out / split).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"cannot make the folder {out}: {error.strerror}: choose another with --out") from error
-    _write_json(manifest, {"key": key, "complete": False})
+    write_json(manifest, {"key": key, "complete": False})
     return False
-
-
-def _write_json(path: Path, data: dict):
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        temporary.write_text(json.dumps(data, indent=1) + "\n")
-        os.replace(temporary, path)
-    except OSError as error:
-        raise UserError(f"cannot write {path}: {error.strerror}: free some space or choose another folder") from error
 
 
 def _frame(split: str, index: int, camera: Camera) -> dict:
@@ -325,6 +304,6 @@ def render_dataset(
             progress.update((index + 1) / len(views), views=index + 1)
     for split, cs in cameras.items():
         frames = [_frame(split, i, camera) for i, camera in enumerate(cs)]
-        _write_json(out / f"transforms_{split}.json", {"camera_angle_x": math.radians(FOV), "frames": frames})
-    _write_json(out / "truth.json", {"key": key, "complete": True})
+        write_json(out / f"transforms_{split}.json", {"camera_angle_x": math.radians(FOV), "frames": frames})
+    write_json(out / "truth.json", {"key": key, "complete": True})
     return out

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from .. import __version__, report
-from ..core.files import atomic_file
+from ..core.files import write_json
 from ..core.progress import Progress
 from ..core.runtime import peak_rss_mb
 from ..evaluation import evaluate, lpips, pictures
@@ -85,8 +85,7 @@ def measure(surfels, lighting, dataset, background, spp, folder, quiet) -> tuple
 def publish(folder, figures, curves, rows, environment, others=()):
     """Write metrics.json, contact sheet and report into ``folder``, and print what came out and where it is, the paths
     ``others`` among it. ``figures``: what metrics.json holds; ``curves``, ``rows``: see `report.write`."""
-    with atomic_file(folder / METRICS) as stream:
-        stream.write((json.dumps(figures, indent=1, default=str) + "\n").encode())
+    write_json(folder / METRICS, figures)
     lines, texels = _summary(figures), environment.texels.numpy()
     pictures.contact_sheet(folder / SHEET, list(rows.values()), texels, folder.resolve().name, lines)
     report.write(folder, figures, curves, rows, texels)
