@@ -18,7 +18,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import as_float
-from ..core.files import write_png
+from ..core.files import write_json, write_png
 from ..core.runtime import cache_folder
 from ..core.scene_files import load_scene, spp_of
 from ..datasets import load_dataset
