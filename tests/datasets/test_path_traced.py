@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from rgs_mi.core.camera import Camera
-from rgs_mi.core.color import srgb_encode
 from rgs_mi.core.errors import UserError
 from rgs_mi.datasets import path_traced
 
