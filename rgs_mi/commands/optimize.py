@@ -69,7 +69,11 @@ def optimize(
     dataset = scene.dataset(quiet)
     make_folder(folder)
     fit = _resume(saved, scene, dataset, settings) if saved else start(scene, dataset, settings, quiet)
-    stopped = _loop(fit, folder, quiet, events)
+    try:
+        stopped = _loop(fit, folder, quiet, events)
+    finally:
+        if events:
+            events.close()
     results.write(fit, scene, folder, quiet)
     if stopped:
         print(f"stopped at {100 * fit.progress:.0f}%; go on with the same command and --resume")

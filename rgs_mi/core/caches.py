@@ -25,7 +25,7 @@ def cached_arrays(
     path = Path(path)
     if path.is_file():
         try:
-            with np.load(path, allow_pickle=False) as stored:
+            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as stored:
                 arrays = dict(stored)
             check(arrays)
             return arrays

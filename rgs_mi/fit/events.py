@@ -46,9 +46,16 @@ class Events:
         values = [self._summary.Value(tag=name, simple_value=value) for name, value in scalars.items()]
         self._write(row["step"], summary=self._summary(value=values))
 
+    def close(self) -> None:
+        """Close the file; to be called once."""
+        self._guarded(self._writer.close)
+
     def _write(self, step, **content):
+        event = self._event(wall_time=time.time(), step=step, **content)
+        self._guarded(lambda: (self._writer.write_event(event), self._writer.flush()))
+
+    def _guarded(self, write):
         try:
-            self._writer.write_event(self._event(wall_time=time.time(), step=step, **content))
-            self._writer.flush()
+            write()
         except OSError as error:
-            warnings.warn(f"{self.folder}: can't be written ({error.strerror or error}), the fit goes on", stacklevel=3)
+            warnings.warn(f"{self.folder}: can't be written ({error.strerror or error}), the fit goes on", stacklevel=4)

@@ -69,7 +69,7 @@ def _read(path: Path) -> np.ndarray:
 
 
 def _read_npz(path):
-    with np.load(path, allow_pickle=False) as arrays:
+    with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as arrays:
         if "depth" not in arrays and len(arrays) != 1:
             raise ValueError(f"none of its arrays ({', '.join(arrays) or 'it has none'}) is called 'depth'")
         if max(info.file_size for info in arrays.zip.infolist()) > 16 * MAX_PIXELS:
