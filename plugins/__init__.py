@@ -38,7 +38,7 @@ def register() -> None:
 
 
 def surfels_of(scene: "mi.Scene", path: str | Path) -> "SurfelShape":
-    """The scene's one `surfels` shape. Raises: UserError where there is none, or more."""
+    """Return the scene's one `surfels` shape. Raises: UserError where there is none, or more."""
     from .surfels import SurfelShape  # of the variant that is active now
 
     found = [shape for shape in scene.shapes() if isinstance(shape, SurfelShape)]
@@ -48,14 +48,14 @@ def surfels_of(scene: "mi.Scene", path: str | Path) -> "SurfelShape":
 
 
 def is_deferred(integrator: "mi.Integrator") -> bool:
-    """Whether the integrator is an 'rgs_deferred'."""
+    """Return whether the integrator is an 'rgs_deferred'."""
     from .rgs_deferred import DeferredIntegrator
 
     return isinstance(integrator, DeferredIntegrator)
 
 
 def deferred_of(scene: "mi.Scene", path: str | Path) -> "DeferredIntegrator":
-    """The scene's integrator. Raises: UserError where it is another than 'rgs_deferred'."""
+    """Return the scene's integrator. Raises: UserError where it is another than 'rgs_deferred'."""
     integrator = scene.integrator()
     if not is_deferred(integrator):
         raise UserError(f"{path}: its integrator is a {integrator.class_name()}: surfels need 'rgs_deferred'")
@@ -63,7 +63,7 @@ def deferred_of(scene: "mi.Scene", path: str | Path) -> "DeferredIntegrator":
 
 
 def lit_surfels(scene: "mi.Scene", path: str | Path) -> "tuple[Surfels, Lighting | None]":
-    """The scene's `Surfels`, and the `Lighting` by which its integrator shades them (None: diffuse radiance alone).
+    """Return the scene's `Surfels`, and the `Lighting` by which its integrator shades them (None: diffuse radiance alone).
 
     Raises: UserError where there are no surfels, more than one shape of them, or another integrator than 'rgs_deferred'.
     """

@@ -28,7 +28,7 @@ from rgs_mi.targets import environments
 
 
 def procedural_mesh(props: "mi.Properties") -> "mi.Mesh":
-    """The factory of ``<shape type="procedural_mesh">``."""
+    """Make the mesh of ``<shape type="procedural_mesh">``. Raises: UserError for an unknown model or part."""
     part = targets.mesh(str(props["model"]), str(props["part"]))
     to_world = np.array(props.get("to_world", mi.ScalarTransform4f()).matrix, np.float64)
     vertices = part.vertices @ to_world[:3, :3].T + to_world[:3, 3]
@@ -44,7 +44,7 @@ def procedural_mesh(props: "mi.Properties") -> "mi.Mesh":
 
 
 def procedural_envmap(props: "mi.Properties") -> "mi.Emitter":
-    """The factory of ``<emitter type="procedural_envmap">``."""
+    """Make the ``envmap`` of ``<emitter type="procedural_envmap">``. Raises: UserError for an unknown name."""
     if props["name"] == "constant":
         pixels = environments.constant(float(props.get("radiance", 0.5)), int(props.get("height", 128)))
     else:

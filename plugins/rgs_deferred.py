@@ -95,7 +95,9 @@ DIFFUSE = ("radiance", "lit")
 
 
 class DeferredIntegrator(mi.SamplingIntegrator):
-    def __init__(self, props):
+    """This is the integrator that the module describes."""
+
+    def __init__(self, props: "mi.Properties") -> None:
         super().__init__(props)  # takes hide_emitters
         if not mi.is_rgb:
             raise UserError(f"rgs_deferred: variant '{mi.variant()}' is not supported: use llvm_ad_rgb or cuda_ad_rgb")
@@ -114,9 +116,23 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         self.filtered = None
 
     def aov_names(self) -> list[str]:
+        """Return the names of the channels behind R, G, B and alpha, in their order."""
         return [f"{name}.{channel}" for name, kind in self.aovs.items() for channel in AOVS[kind]]
 
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+    def render(
+        self,
+        scene: "mi.Scene",
+        sensor: "mi.Sensor | int" = 0,
+        seed: "mi.UInt32 | int" = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
+    ) -> "mi.TensorXf":
+        """Return the image [height, width, channels] that ``sensor`` sees, linear radiance, and put it on its film; ``spp`` 0
+        means as many samples per pixel as its sampler has.
+
+        Raises: UserError for a film of another type than 'hdrfilm', and for a scene that can't be shaded.
+        """
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         film = sensor.film()
         if mi.has_flag(film.flags(), mi.FilmFlags.Special):
@@ -133,16 +149,33 @@ class DeferredIntegrator(mi.SamplingIntegrator):
 
     # Without these two, mi.render() differentiates through a fallback that unrolls all loops.
 
-    def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+    def render_forward(
+        self,
+        scene: "mi.Scene",
+        params: Any,
+        sensor: "mi.Sensor | int" = 0,
+        seed: "mi.UInt32 | int" = 0,
+        spp: int = 0,
+    ) -> "mi.TensorXf":
+        """Return the derivative of the image along the gradients that are set on the scene's parameters."""
         image = self.render(scene, sensor, seed, spp, evaluate=False)
         dr.forward_to(image)
         return dr.grad(image)
 
-    def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+    def render_backward(
+        self,
+        scene: "mi.Scene",
+        params: Any,
+        grad_in: "mi.TensorXf",
+        sensor: "mi.Sensor | int" = 0,
+        seed: "mi.UInt32 | int" = 0,
+        spp: int = 0,
+    ) -> None:
+        """Accumulate the gradients of the scene's parameters, of which ``grad_in`` is that of the image."""
         image = self.render(scene, sensor, seed, spp, evaluate=False)
         dr.backward_from(image * grad_in)
 
-    def to_string(self):
+    def to_string(self) -> str:
         return f"DeferredIntegrator[specular = {self.specular}, aovs = {', '.join(self.aovs)}]"
 
     # ---- One image ----
@@ -165,14 +198,22 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         return _average(values, width, height, samples)
 
     def lighting(
-        self, scene: "mi.Scene", surfels: Surfels, eta: float, environment: FilteredEnvironment | None, seed: int
+        self,
+        scene: "mi.Scene",
+        surfels: Surfels,
+        eta: float,
+        environment: FilteredEnvironment | None,
+        seed: "mi.UInt32 | int",
     ) -> Lighting | None:
-        """By what `deferred.shade` shades ``surfels`` in the ``scene``, whose `environment` this is; None: nothing."""
+        """Return by what `deferred.shade` shades ``surfels`` in the ``scene``, whose `environment` this is; None: nothing."""
         shading = Shading(self.specular, self.diffuse, self.samples, eta, self.box, self.indirect)
         return lighting_of(shading, surfels, environment, scene.environment(), self.shader, seed)
 
     def environment(self, scene: "mi.Scene") -> FilteredEnvironment | None:
-        """The scene's environment, filtered as the estimator needs it; kept until texels change."""
+        """Return the scene's environment, filtered as the estimator needs it, which is kept until texels change.
+
+        Raises: UserError where the scene has none and something is specular.
+        """
         emitter = scene.environment()
         if emitter is None:
             if self.specular == "none":
@@ -210,7 +251,7 @@ def _aovs(text) -> dict[str, str]:
 
 
 def _aov(kind, image, maps, camera, rays):
-    """Channels of one AOV, premultiplied, a list of ``mi.Float`` with one lane a sample."""
+    """Channels of one AOV, premultiplied, a list of ``mi.Float`` with one entry per sample."""
     if kind == "depth":
         forward = mi.Vector3f(*[dr.opaque(mi.Float, float(v)) for v in camera.rotation[2]])
         return [maps.depth / dr.dot(rays, forward)]
@@ -227,7 +268,7 @@ def _aov(kind, image, maps, camera, rays):
 
 
 def _average(values, width, height, samples):
-    """[height, width, channels] means over samples × samples blocks of ``values``, which have one lane a sample."""
+    """[height, width, channels] means over samples × samples blocks of ``values``, which have one entry per sample."""
     n = width * height * samples**2
     flat = dr.empty(mi.Float, n * len(values))
     row = dr.arange(mi.UInt32, n) * len(values)

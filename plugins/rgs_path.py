@@ -51,7 +51,9 @@ _SHADOW = 1 - 1e-4  # of the way to a light, so as not to meet it
 
 
 class SurfelPathIntegrator(mi.SamplingIntegrator):
-    def __init__(self, props):
+    """This is the integrator that the module describes."""
+
+    def __init__(self, props: "mi.Properties") -> None:
         super().__init__(props)  # takes hide_emitters
         if not mi.is_rgb:
             raise UserError(f"rgs_path: variant '{mi.variant()}' is not supported: use llvm_ad_rgb or cuda_ad_rgb")
@@ -65,7 +67,15 @@ class SurfelPathIntegrator(mi.SamplingIntegrator):
             raise UserError(f"rgs_path: unknown diffuse '{self.diffuse}': choose one of {', '.join(DIFFUSE)}")
 
     @dr.syntax
-    def sample(self, scene, sampler, ray, medium=None, active=True):
+    def sample(
+        self,
+        scene: "mi.Scene",
+        sampler: "mi.Sampler",
+        ray: "mi.RayDifferential3f",
+        medium: "mi.Medium | None" = None,
+        active: "mi.Bool | bool" = True,
+    ) -> "tuple[mi.Color3f, mi.Bool, list[mi.Float]]":
+        """Return the linear radiance along ``ray``, whether it meets something, and no AOVs."""
         surfels, eta = surfels_in(scene)
         surfel_rays, lit = SurfelRayTracer(surfels, self.box), self.diffuse == "lit"
         lobe_of = WholeLobe if lit else SpecularLobe
@@ -144,7 +154,7 @@ class SurfelPathIntegrator(mi.SamplingIntegrator):
 
         return dr.select(seen, L, 0), seen, []
 
-    def to_string(self):
+    def to_string(self) -> str:
         return f"SurfelPathIntegrator[diffuse = {self.diffuse}]"
 
 

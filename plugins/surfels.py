@@ -70,7 +70,9 @@ class _MeshBuffers(mi.TraversalCallback):
 
 
 class SurfelShape(mi.Mesh):
-    def __init__(self, props):
+    """This is the shape that the module describes."""
+
+    def __init__(self, props: "mi.Properties") -> None:
         super().__init__(props)
         if "to_world" in props:
             raise UserError(f"surfels '{self.id()}': 'to_world' is not supported: transform the file instead")
@@ -86,17 +88,22 @@ class SurfelShape(mi.Mesh):
 
     @property
     def surfels(self) -> Surfels:
-        """The live tensors, with their gradients."""
+        """The shape's `Surfels`: the live tensors, with their gradients."""
         return Surfels(**{name: getattr(self, name) for name in CHANNELS}, two_sided=self.two_sided)
 
-    def traverse(self, callback):
+    def traverse(self, callback: "mi.TraversalCallback") -> None:
+        """Show the fields of the surfels to ``callback``; those that move edges are discontinuous."""
         for name in CHANNELS:
             flags = mi.ParamFlags.Differentiable
             if name in GEOMETRY:
                 flags = flags | mi.ParamFlags.Discontinuous
             callback.put(name, getattr(self, name), flags)
 
-    def parameters_changed(self, keys):
+    def parameters_changed(self, keys: list[str]) -> None:
+        """Check the fields, and rebuild the proxies where ``keys`` (none: all) have some of `GEOMETRY` among them.
+
+        Raises: UserError for fields of different lengths, or of a wrong shape.
+        """
         self._check()
         if not keys or set(GEOMETRY) & set(keys):
             self._rebuild()
@@ -127,12 +134,12 @@ class SurfelShape(mi.Mesh):
             mi.Mesh.traverse(self, _MeshBuffers({"vertex_positions": positions, "faces": faces}))
         mi.Mesh.parameters_changed(self, ["vertex_positions", "faces"])
 
-    def to_string(self):
+    def to_string(self) -> str:
         return f"Surfels[id = {self.id()}, count = {len(self.surfels)}, proxies = {self.proxies}]"
 
 
 def surfels_in(scene: "mi.Scene") -> tuple[Surfels, float]:
-    """(all surfels of the scene as one `Surfels`, their index of refraction).
+    """Return all surfels of the scene as one `Surfels`, and their index of refraction.
 
     Raises: UserError where there are none, or they differ in what all have to share.
     """
@@ -160,7 +167,7 @@ def _concatenate(clouds):
 
 
 def box_of(props: "mi.Properties") -> BoundingBox | None:
-    """The property ``box`` of an integrator as a `BoundingBox`, None where it has none. Raises: UserError for a bad one."""
+    """Return the property ``box`` of an integrator, None where it has none. Raises: UserError for a bad one."""
     text = props.get("box", "")
     try:
         return BoundingBox.of(text.replace(",", " ").split()) if text else None
@@ -169,7 +176,7 @@ def box_of(props: "mi.Properties") -> BoundingBox | None:
 
 
 def resolve(path: str) -> str:
-    """``path`` as Mitsuba's own plugins find files: relative to the scene."""
+    """Return ``path`` as Mitsuba's own plugins find files, relative to the scene; '' stays."""
     return str(mi.file_resolver().resolve(path)) if path else ""
 
 

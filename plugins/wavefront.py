@@ -2,9 +2,8 @@
 Values of a wavefront as a texture (:monosp:`wavefront`)
 --------------------------------------------------------
 
-Lane *k* of an evaluation sees entry *k* of ``values``, whatever the surface: so a BSDF of Mitsuba's can be
-evaluated for many materials at once, each lane its own. Set ``values`` before each evaluation; its width must be one or that
-of the evaluation. For code, not for scene files.
+Entry *k* of an evaluation sees entry *k* of ``values``, whatever the surface: so a BSDF of Mitsuba's can be evaluated for
+many materials at once, one per entry. Set ``values`` before each evaluation; its width must be one or that of the evaluation. For code, not for scene files.
 
 .. pluginparameters::
 
@@ -17,26 +16,26 @@ import mitsuba as mi
 
 
 class WavefrontTexture(mi.Texture):
-    """``values``: ``mi.Float`` for one channel, ``mi.Color3f`` for three."""
+    """The texture shows ``values``, a ``mi.Float`` for one channel, a ``mi.Color3f`` for three."""
 
-    def __init__(self, props):
+    def __init__(self, props: "mi.Properties") -> None:
         super().__init__(props)
         self.channels = int(props.get("channels", 1))
         self.values = mi.Float(0.5) if self.channels == 1 else mi.Color3f(0.5)
 
-    def eval(self, si, active=True):
+    def eval(self, si: "mi.SurfaceInteraction3f", active: "mi.Bool | bool" = True) -> "mi.Color3f":
         return mi.Color3f(self.values)
 
-    def eval_1(self, si, active=True):
+    def eval_1(self, si: "mi.SurfaceInteraction3f", active: "mi.Bool | bool" = True) -> "mi.Float":
         return self.values
 
-    def eval_3(self, si, active=True):
+    def eval_3(self, si: "mi.SurfaceInteraction3f", active: "mi.Bool | bool" = True) -> "mi.Color3f":
         return mi.Color3f(self.values)
 
-    def is_spatially_varying(self):
+    def is_spatially_varying(self) -> bool:
         return True
 
-    def to_string(self):
+    def to_string(self) -> str:
         return f"WavefrontTexture[channels = {self.channels}]"
 
 

@@ -30,7 +30,7 @@ class Progress:
       label: what is going on
     """
 
-    def __init__(self, total: float | None = None, quiet: bool = False, label: str = "fitting"):
+    def __init__(self, total: float | None = None, quiet: bool = False, label: str = "fitting") -> None:
         self.total, self.quiet, self.label = total, quiet, label
         self.fraction, self.fields = 0.0, {}
         self._live = None

@@ -30,7 +30,7 @@ class Sheet:
         title: str = "",
         text_size: int = 20,
         below: int = 0,
-    ):
+    ) -> None:
         from matplotlib.figure import Figure
 
         shapes = [next(image.shape for image in row if image is not None) for row in rows]

@@ -112,7 +112,7 @@ def _farthest(shape, point: np.ndarray) -> float:
 class Renderer:
     """A loaded scene and one camera that moves: kernels are compiled for the first view only."""
 
-    def __init__(self, scene: "mi.Scene", size: int):
+    def __init__(self, scene: "mi.Scene", size: int) -> None:
         import mitsuba as mi
 
         camera = Camera.look_at((1, 0, 0), (0, 0, 0), (0, 0, 1), FOV, (size, size))

@@ -50,7 +50,7 @@ class Photographs:
         downscale: int,
         background: float,
         priors: Sequence[DepthPrior] | None = None,
-    ):
+    ) -> None:
         self.views, self.downscale, self.background, self.priors = views, downscale, background, priors
         self._images = {}
         self._windows = _windows(views, downscale)

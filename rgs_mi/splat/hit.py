@@ -56,7 +56,7 @@ class Hit:
     low-pass decides.
     """
 
-    def __init__(self, gaussian: "Sequence[mi.Float]", x: "mi.Float", y: "mi.Float", cutoffs: Cutoffs):
+    def __init__(self, gaussian: "Sequence[mi.Float]", x: "mi.Float", y: "mi.Float", cutoffs: Cutoffs) -> None:
         X, Y, A_x, A_y, B_x, B_y, N_x, N_y, z, opacity = gaussian[: len(GEOMETRY)]
         self.dx, self.dy = x - X, y - Y
         h = 1 + N_x * self.dx + N_y * self.dy

@@ -42,7 +42,7 @@ class Proxies:
       clearance  how far above the surface rays start, world units, of width 1
     """
 
-    def __init__(self, surfels: Surfels, solid: float = _SOLID, box: BoundingBox | None = None):
+    def __init__(self, surfels: Surfels, solid: float = _SOLID, box: BoundingBox | None = None) -> None:
         with dr.suspend_grad():
             opacity = surfels.column(mi.Float, "opacities")
             if box is not None:

@@ -52,7 +52,7 @@ class SurfelRayTracer:
     """Surfels as rays meet them, those in the ``box`` where there is one; not differentiated. Its methods may be called
     within symbolic loops."""
 
-    def __init__(self, surfels: Surfels, box: BoundingBox | None = None):
+    def __init__(self, surfels: Surfels, box: BoundingBox | None = None) -> None:
         with dr.suspend_grad():
             self.proxies = Proxies(surfels, _CUTOFFS.alpha_min, box)
             column = surfels.column
