@@ -70,7 +70,7 @@ import drjit as dr
 import mitsuba as mi
 from rgs_mi.plugins.surfels import box_of, resolve, surfels_in
 
-from rgs_mi.core.camera import Camera
+from rgs_mi.core.camera import Camera, pixel_directions
 from rgs_mi.core.errors import UserError
 from rgs_mi.shading import deferred, indirect
 from rgs_mi.shading.deferred import Lighting, Shading
@@ -188,7 +188,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         environment = self.environment(scene)
         image = deferred.render(surfels, camera, self.lighting(scene, surfels, eta, environment, seed))
         maps = image.gbuffer.all
-        rays = deferred.pixel_directions(camera, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]))
+        rays = pixel_directions(camera, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]))
         color, alpha = image.color, maps.alpha
         if not self.hide_emitters and environment is not None:
             color, alpha = color + (1 - alpha) * environment.eval(rays), mi.Float(1)

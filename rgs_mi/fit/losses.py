@@ -5,11 +5,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import as_float
-from ..core.camera import Camera
+from ..core.camera import Camera, pixel_rays
 from ..shading.deferred import COVERED
 from ..splat.gbuffer import GBuffer, Maps
 from ..splat.hit import adding
-from ..splat.project import opaque
 
 SATURATED = 0.995  # display value from which a photograph only says "at least this bright"
 _WINDOW, _SIGMA = 11, 1.5  # SSIM's Gaussian window
@@ -115,17 +114,13 @@ def depth_normal_consistency(gbuffer: GBuffer, camera: Camera) -> "mi.Float":
     index = _interior(gbuffer)
     if dr.width(index) == 0:
         return mi.Float(0)
-    R, _, f, principal = opaque(camera)
 
     def point(i):
         m = gbuffer.maps(i)
-        z = m.depth / m.alpha
-        return mi.Vector3f(
-            (mi.Float(i % width) + 0.5 - principal.x) / f.x * z, (mi.Float(i // width) + 0.5 - principal.y) / f.y * z, z
-        )
+        return pixel_rays(camera, i) * (m.depth / m.alpha)  # relative to the camera, world space
 
     n_depth = dr.normalize(dr.cross(point(index + width) - point(index - width), point(index + 1) - point(index - 1)))
-    n = dr.normalize(R @ gbuffer.maps(index).normal)
+    n = dr.normalize(gbuffer.maps(index).normal)
     return dr.sum(1 - dr.dot(n, n_depth)) / (width * height)
 
 
