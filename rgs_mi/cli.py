@@ -3,13 +3,15 @@ neither help nor a bad option starts Mitsuba."""
 
 import argparse
 import sys
+from collections.abc import Callable
+from typing import NoReturn
 
 from .core.errors import run_main
 from .core.runtime import CACHE_VARIABLE, cache_folder
 from .verbs import fits, renderings, suites
 from .verbs.arguments import Parser
 
-VERBS = {
+VERBS: dict[str, Callable[[Parser], Callable[[argparse.Namespace], object]]] = {
     "optimize": fits.optimize,
     "evaluate": fits.evaluate,
     "recovery": fits.recovery,
@@ -22,7 +24,7 @@ VERBS = {
 }
 
 
-def main(verb: str | None = None):
+def main(verb: str | None = None) -> NoReturn:
     """Run what the command line says, and end the process (`run_main`); the scripts of a clone give the ``verb``."""
     run_main(lambda: _run([*([verb] if verb else []), *sys.argv[1:]]))
 
