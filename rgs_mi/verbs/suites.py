@@ -1,5 +1,7 @@
 """The verbs of many fits and of measurements: ablate, benchmark, crossvalidate, fit-taps."""
 
+import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 from ..core.runtime import set_variant
@@ -7,7 +9,7 @@ from ..core.scene_files import bundled, find_scene
 from .arguments import Parser, add_budget, add_common, add_integer, add_names, add_out, add_set, check_settings
 
 
-def ablate(parser):
+def ablate(parser: Parser) -> Callable[[argparse.Namespace], bool]:
     """Fit variants of the method to a suite of scenes, and table what each part of it brings. The same command goes on where it
     was interrupted, and does not repeat what is done."""
     _suite_of(parser, "suite")
@@ -40,7 +42,7 @@ def _suite_of(parser, name):
     add_names(parser, "--scenes", "these only")
 
 
-def benchmark(parser):
+def benchmark(parser: Parser) -> Callable[[argparse.Namespace], object]:
     """Fit and judge a suite of captures beside the paper's tables; or time the splatter, or the step of a fit."""
     commands = parser.add_subparsers(dest="command", required=True, parser_class=Parser)
     for define in (_suite, _splat, _step):
@@ -112,7 +114,7 @@ def _step(parser):
     return run
 
 
-def crossvalidate(parser):
+def crossvalidate(parser: Parser) -> Callable[[argparse.Namespace], bool]:
     """Compare our estimators of what a principled BSDF reflects with Mitsuba's path tracer; 1 where a bound is broken."""
     add_names(parser, "--shapes", "sphere, and models of the suite, e.g. helmet (default: sphere)", default=["sphere"])
     add_names(parser, "--environments", "of the suite (default: three)")
@@ -134,7 +136,7 @@ def crossvalidate(parser):
     return run
 
 
-def fit_taps(parser):
+def fit_taps(parser: Parser) -> Callable[[argparse.Namespace], None]:
     """Fit where split-sum looks the environment up (rgs_mi/shading/taps.npy) to the Monte Carlo estimator; minutes."""
     add_integer(parser, "--environments", 24, "random ones to fit to")
     add_integer(parser, "--steps", 1500, "of the optimiser")
