@@ -32,7 +32,7 @@ def write_pages(app):
         parts = [_title(package, "=")]
         for name in modules:
             parts += [] if name == package else [_title(name.removeprefix(f"{package}."), "-")]
-            parts.append(f".. automodule:: {name}\n   :members:\n   :ignore-module-all:\n")
+            parts.append(f".. automodule:: {name}\n   :members:\n   :undoc-members:\n   :ignore-module-all:\n")
         (out / f"{package}.rst").write_text("\n".join(parts))
     entries = "".join(f"   {package}\n" for package in folders())
     (out / "index.rst").write_text(
