@@ -25,5 +25,6 @@ myst_heading_anchors = 3
 default_role = "py:obj"  # what single backticks name in docstrings
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
+napoleon_use_ivar = True  # attributes are also members
 nitpicky = True
 nitpick_ignore_regex = [("py:.*", ".*")]  # docstrings also name what is Mitsuba's, NumPy's or private
