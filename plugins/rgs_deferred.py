@@ -133,14 +133,14 @@ class DeferredIntegrator(mi.SamplingIntegrator):
 
         Raises: UserError for a film of another type than 'hdrfilm', and for a scene that can't be shaded.
         """
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        film = sensor.film()
+        chosen: mi.Sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        film = chosen.film()
         if mi.has_flag(film.flags(), mi.FilmFlags.Special):
             raise UserError(f"rgs_deferred: film '{film.id()}' is a {film.class_name()}: use an 'hdrfilm'")
         film.prepare(self.aov_names())
-        spp = spp or sensor.sampler().sample_count()
+        spp = spp or chosen.sampler().sample_count()
         has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-        channels = self._channels(scene, Camera.from_sensor(sensor), spp, has_alpha, seed)
+        channels = self._channels(scene, Camera.from_sensor(chosen), spp, has_alpha, seed)
         film.put_block(mi.ImageBlock(channels, film.crop_offset()))
         image = film.develop() if develop else mi.TensorXf()
         if evaluate:

@@ -3,7 +3,8 @@ Values of a wavefront as a texture (:monosp:`wavefront`)
 --------------------------------------------------------
 
 Entry *k* of an evaluation sees entry *k* of ``values``, whatever the surface: so a BSDF of Mitsuba's can be evaluated for
-many materials at once, one per entry. Set ``values`` before each evaluation; its width must be one or that of the evaluation. For code, not for scene files.
+many materials at once, one per entry. Set ``values`` before each evaluation; its width must be one or that of the evaluation.
+For code, not for scene files.
 
 .. pluginparameters::
 

@@ -22,7 +22,7 @@ VERBS = {
 }
 
 
-def main(verb: str | None = None):
+def main(verb: str | None = None) -> None:
     """Run what the command line says, and end the process (`run_main`); the scripts of a clone give the ``verb``."""
     run_main(lambda: _run([*([verb] if verb else []), *sys.argv[1:]]))
 

@@ -2,13 +2,14 @@
 pictures. What `rgs-mi ablate` calls.
 
     OUT/ablation.md, .csv, .json     every fit's figures, and means; written again after each fit
-    OUT/SCENE.png                    a few test views: the truth and all variants, normals below
+    OUT/SCENE.png                    a few test views: ground truth and all variants, normals below
     OUT/SCENE/VARIANT[-SEED]/        the runs, as `rgs-mi optimize` makes them
 """
 
 import itertools
 import sys
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,8 +24,8 @@ from .jobs import Job, budget, check_names, check_photographs, effort, find_scen
 
 @dataclass(frozen=True)
 class Variant:
-    """A ``preset`` and ``overrides``. ``against``: the variant that it is compared with; ``scenes``: fitted to so many of
-    a suite, the first (None: to all), unless someone asks for it by name."""
+    """A variant of the settings: a ``preset`` and ``overrides``. ``label`` is its name in tables; ``against`` is the variant
+    that it is compared with; it is fitted to the first ``scenes`` of a suite (None: to all), unless it is asked for by name."""
 
     label: str
     preset: str
@@ -88,12 +89,22 @@ PAPER = {
 
 
 def known_variants() -> dict[str, Variant]:
-    """`VARIANTS`, and every preset by its name."""
+    """Return `VARIANTS`, and every preset by its name."""
     return {name: Variant(f"preset {name}", name) for name in presets()} | VARIANTS
 
 
-def plan(suite, xml, *, scenes=None, variants=None, minutes=None, overrides=(), seeds=(0,), out) -> list[Job]:
-    """All fits of an ablation, seed by seed and scene by scene (arguments: see `ablate`).
+def plan(
+    suite: str | Path,
+    xml: str | Path,
+    *,
+    scenes: Sequence[str] | None = None,
+    variants: Sequence[str] | None = None,
+    minutes: float | None = None,
+    overrides: Sequence[str] = (),
+    seeds: Sequence[int] = (0,),
+    out: str | Path,
+) -> list[Job]:
+    """Return all fits of an ablation, seed by seed and scene by scene (arguments: see `ablate`).
 
     Raises: UserError for a scene, variant or setting that does not exist.
     """
@@ -102,8 +113,8 @@ def plan(suite, xml, *, scenes=None, variants=None, minutes=None, overrides=(), 
     check_names("variant", variants, known)
     template = FitScene.load(xml, next(iter(found.values())))
     jobs = []
-    shown = dict.fromkeys([*VARIANTS, *(variants or ())])
-    for seed, (k, scene), name in itertools.product(dict.fromkeys(seeds), enumerate(found), shown):
+    listed = dict.fromkeys([*VARIANTS, *(variants or ())])
+    for seed, (k, scene), name in itertools.product(dict.fromkeys(seeds), enumerate(found), listed):
         variant = known[name]
         wanted = name in variants if variants else variant.scenes is None or k < variant.scenes
         changes = (*variant.overrides, *overrides, *budget(minutes), f"seed={seed}")
@@ -127,7 +138,16 @@ def plan(suite, xml, *, scenes=None, variants=None, minutes=None, overrides=(), 
 
 
 def ablate(
-    suite, xml, *, scenes=None, variants=None, minutes=None, overrides=(), seeds=(0,), out="runs/ablation", quiet=False
+    suite: str | Path,
+    xml: str | Path,
+    *,
+    scenes: Sequence[str] | None = None,
+    variants: Sequence[str] | None = None,
+    minutes: float | None = None,
+    overrides: Sequence[str] = (),
+    seeds: Sequence[int] = (0,),
+    out: str | Path = "runs/ablation",
+    quiet: bool = False,
 ) -> int:
     """Fit what is not yet fitted; write tables and pictures (see the module). Ctrl-C saves; the same call then goes on.
 
@@ -184,14 +204,14 @@ def _fit_scene(group, jobs, errors, xml, out, quiet):
                     failed(job, error)
                 _write(jobs, errors, out)
     finally:
-        shown = [
+        columns = [
             (known_variants()[job.variant].label, job.figures(), job.folder)
             for job in jobs
             if (job.scene, job.seed) == (scene, jobs[0].seed) and job.folder not in errors and job.figures()
         ]
         try:
-            if shown:
-                pictures.write(out / f"{scene}.png", views, shown, group[0].settings["background"])
+            if columns:
+                pictures.write(out / f"{scene}.png", views, columns, group[0].settings["background"])
         except Exception as error:  # of a damaged run
             warnings.warn(f"{out / scene}: no picture ({type(error).__name__}: {error})", stacklevel=2)
 

@@ -5,6 +5,8 @@ import re
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -41,8 +43,8 @@ def _milliseconds(call, repeat=_REPEAT) -> float:
 # ---- Splatter ----
 
 
-def sphere(count: int, seed=0) -> Surfels:
-    """Random surfels on the unit sphere, that cover it about four times."""
+def sphere(count: int, seed: int = 0) -> Surfels:
+    """Return ``count`` random surfels on the unit sphere, which cover it about four times."""
     rng = np.random.default_rng(seed)
     unit = lambda v: v / np.linalg.norm(v, axis=1, keepdims=True)
     centers = unit(rng.normal(size=(count, 3)))
@@ -66,7 +68,8 @@ def sphere(count: int, seed=0) -> Surfels:
 
 
 def splat_times(surfels: Surfels, size: int) -> dict[str, float]:
-    """Times of `STAGES` for a square image: lists; records and forward walk; backward walk to geometry and features."""
+    """Return the times of `STAGES` in ms for an image of ``size`` x ``size`` pixels: the intersections of tiles, compositing, and
+    its derivative by geometry and features."""
     camera = Camera.look_at((0, 0, 4), (0, 0, 0), (0, 1, 0), _FOV, (size, size))
     rng = np.random.default_rng(1)
     projected = project(surfels, camera)
@@ -94,8 +97,11 @@ def splat_times(surfels: Surfels, size: int) -> dict[str, float]:
     return times | {"backward": 1e3 * float(np.median(seconds[1:]))}
 
 
-def other_times(script, count: int, size: int) -> dict[str, float]:
-    """Times of `STAGES` that ``script --surfels N --res R`` prints, as 'forward   12.3 ms'."""
+def other_times(script: str | Path, count: int, size: int) -> dict[str, float]:
+    """Return the times of `STAGES` in ms that ``script --surfels N --res R`` prints, as 'forward   12.3 ms'.
+
+    Raises: UserError where it does not print one of them.
+    """
     command = [sys.executable, str(script), "--surfels", str(count), "--res", str(size)]
     done = subprocess.run(command, capture_output=True, text=True)
     found = {name: float(value) for name, value in re.findall(r"^(\w+)\s+([\d.]+) ms", done.stdout, re.MULTILINE)}
@@ -105,7 +111,7 @@ def other_times(script, count: int, size: int) -> dict[str, float]:
     return {name: found[name] for name in STAGES}
 
 
-def splat(count=50_000, size=800, against=None, rounds=3):
+def splat(count: int = 50_000, size: int = 800, against: str | Path | None = None, rounds: int = 3) -> None:
     """Print the times of the splatter, and of the script ``against`` measured in turns with it."""
     surfels = sphere(count)
     ours, others = [], []
@@ -125,7 +131,9 @@ def splat(count=50_000, size=800, against=None, rounds=3):
 # ---- Step ----
 
 
-def step(path, data, count=15_000, steps=20, overrides=()):
+def step(
+    path: str | Path, data: str | Path | None, count: int = 15_000, steps: int = 20, overrides: Sequence[str] = ()
+) -> None:
     """Print the time of a fit's step on one view at full resolution with ``count`` surfels, and the kernels that were
     compiled after warm-up (which a fit of constant size should not need)."""
     scene = FitScene.load(path, data)

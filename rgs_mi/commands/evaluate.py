@@ -1,7 +1,7 @@
-"""A run judged again on the photographs that it held out: when LPIPS's weights were installed later, or on another machine.
+"""A run evaluated again on the photographs that it held out: when LPIPS's weights were installed later, or on another machine.
 What `rgs-mi evaluate` calls.
 
-What is judged is the scene that the run exported, not a checkpoint of the fit: it is what people use and pass on, says by
+What is evaluated is the scene that the run exported, not a checkpoint of the fit: it is what people use and pass on, says by
 itself how it is shaded, and is there when checkpoints are deleted. Both give the same figures, to rounding.
 """
 
@@ -39,7 +39,7 @@ _FACTS = {
 }  # what metrics.json must say of the fit
 
 
-def reevaluate(run, data=None, quiet=False) -> dict:
+def reevaluate(run: str | Path, data: str | Path | None = None, quiet: bool = False) -> dict:
     """Measure the run in the folder ``run`` again, and write its metrics.json, pictures of test views, contact sheet and
     report anew. What metrics.json says of the fit stays, and LPIPS where its weights are not installed here; ``evaluated``
     says where and by what this was measured.

@@ -1,6 +1,7 @@
 """How ``taps.npy`` was made: split-sum's taps fitted to the Monte Carlo estimator under random environments."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -24,19 +25,23 @@ _MATERIALS = ((0.0, 0.0), (1.0, 1.0), (0.0, 0.0), (1.0, 0.5), (0.0, 0.0), (1.0, 
 
 @dataclass
 class Samples:
-    """Surfaces in one environment, and what they truly reflect."""
+    """``surfaces``, the arguments of an estimator, in one ``environment``, and the linear radiance that they truly reflect."""
 
     environment: FilteredEnvironment
     surfaces: tuple
-    truth: "mi.Color3f"
+    ground_truth: "mi.Color3f"
 
-    def estimate(self, entries=None):
-        """Split-sum's radiance with a table of taps (None: the shipped one)."""
+    def estimate(self, entries: "mi.Float | None" = None) -> "mi.Color3f":
+        """Return split-sum's linear radiance with a table of taps (None: the shipped one)."""
         return SplitSum(self.environment, DEFAULT_ETA, entries).specular(*self.surfaces)
 
 
-def fit_taps(path, environments: int, steps: int, seed: int):
-    """Write a table of taps to ``path``, and print the error on environments that it was not fitted to."""
+def fit_taps(path: str | Path, environments: int, steps: int, seed: int) -> None:
+    """Fit a table of taps to so many random ``environments``, write it to ``path``, and print the error in environments that it
+    was not fitted to.
+
+    Raises: UserError where the file can't be written.
+    """
     with Progress(None, False, "sampling") as progress:
         data = []
         for k in range(environments + 2):
@@ -53,20 +58,21 @@ def fit_taps(path, environments: int, steps: int, seed: int):
         for step in range(steps):
             optimizer.set_learning_rate(_RATES[0] * (_RATES[1] / _RATES[0]) ** (step / steps))
             some = data[step % len(data)]
-            level = dr.opaque(mi.Float, float(0.2 * dr.sum(some.truth.y)[0] / _SURFACES))
-            relative = (some.estimate(optimizer["taps"]) - some.truth) / (some.truth + level)
+            level = dr.opaque(mi.Float, float(0.2 * dr.sum(some.ground_truth.y)[0] / _SURFACES))
+            relative = (some.estimate(optimizer["taps"]) - some.ground_truth) / (some.ground_truth + level)
             dr.backward(dr.sum(dr.sum(dr.sqrt(dr.square(relative) + 1e-4))) / _SURFACES)
             optimizer.step()
             progress.update((step + 1) / steps)
     with atomic_file(path) as stream:
         np.save(stream, optimizer["taps"].numpy().reshape(*SHAPE, 4))
     with dr.suspend_grad():
-        errors = [relative_error(some.estimate(optimizer["taps"]).numpy(), some.truth.numpy()) for some in held_out]
+        estimates = [some.estimate(optimizer["taps"]).numpy() for some in held_out]
+        errors = [relative_error(found, some.ground_truth.numpy()) for found, some in zip(estimates, held_out)]
     print(f"{path}: error in environments that were held out {', '.join(f'{e:.2%}' for e in errors)}")
 
 
 def sampled(texels: np.ndarray, metallic: float, base_color: float, seed: int) -> Samples:
-    """What random surfaces of all roughness, seen as a distant sphere's, reflect of ``texels`` [rows, columns, 3]."""
+    """Return what random surfaces of all roughness, seen as a distant sphere's, reflect of ``texels`` [rows, columns, 3]."""
     rng = np.random.default_rng(seed)
     normal = _unit(rng.normal(size=(_SURFACES, 3)))
     across = rng.normal(size=(_SURFACES, 3))
@@ -87,13 +93,13 @@ def sampled(texels: np.ndarray, metallic: float, base_color: float, seed: int) -
         estimator = MonteCarlo(
             environment.unfiltered(), environment.emitter(), DEFAULT_ETA, _SAMPLES, dr.opaque(mi.UInt32, seed)
         )
-        truth = estimator.specular(*surfaces)
-        dr.eval(truth)
-    return Samples(environment.filtered(), surfaces, truth)
+        ground_truth = estimator.specular(*surfaces)
+        dr.eval(ground_truth)
+    return Samples(environment.filtered(), surfaces, ground_truth)
 
 
-def random_environment(rng) -> np.ndarray:
-    """[rows, columns, 3] waves of all lengths, and a few bright windows."""
+def random_environment(rng: np.random.Generator) -> np.ndarray:
+    """Return an environment of mean radiance 1, [rows, columns, 3]: waves of all lengths, and a few bright windows."""
     theta, phi = np.meshgrid(np.linspace(0, np.pi, _ROWS), np.pi * (np.arange(2 * _ROWS) + 0.5) / _ROWS, indexing="ij")
     d = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), -np.sin(theta) * np.cos(phi)], -1)
     image = np.zeros((_ROWS, 2 * _ROWS, 3))

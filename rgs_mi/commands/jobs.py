@@ -6,12 +6,14 @@ import io
 import json
 import shutil
 import warnings
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
 from ..datasets import is_capture, looked_for
+from ..datasets.types import View
 from ..fit import checkpoint
 from ..fit.scene import FitScene
 from ..report import results
@@ -27,33 +29,34 @@ _DIGEST = "photographs.sha256"  # beside or above the fits: what they are of
 @dataclass(frozen=True)
 class Job:
     """One fit to the photographs ``data`` of ``scene``, into ``folder``: ``overrides`` over ``config`` (a preset, a file or
-    None), which make ``settings`` (nested dicts); ``variant`` and ``seed`` are what tables call it by. ``asked``: it is to
-    be done now; of the others, what is there is shown."""
+    None), which make ``settings`` (nested dicts); ``variant`` and ``seed`` are what tables call it by. ``asked`` says whether
+    it is to be done now; of other jobs, tables have what is there."""
 
     scene: str
     data: Path
     variant: str
     seed: int
-    config: str | None
-    overrides: tuple[str, ...]
+    config: str | Path | None
+    overrides: Sequence[str]
     settings: dict
     folder: Path
     asked: bool
 
     def has(self, saved: dict) -> bool:
-        """Whether the settings ``saved`` with a fit are this job's."""
+        """Return whether the settings ``saved`` with a fit are this job's."""
         return saved == self.settings
 
     def figures(self) -> dict | None:
-        """metrics.json of the finished fit; None where there is none, or one with other settings."""
+        """Return what metrics.json of the finished fit holds; None where there is none, or one with other settings."""
         if not results.finished(self.folder):
             return None
         figures = json.loads((self.folder / results.METRICS).read_text())
         return figures if self.has(figures["settings"]) else None
 
 
-def find_scenes(suite) -> dict[str, Path]:
-    """name -> scene file or capture: the ``*.xml`` in the folder ``suite``, and its subfolders in a layout of `views`.
+def find_scenes(suite: str | Path) -> dict[str, Path]:
+    """Return name -> scene file or capture: the ``*.xml`` in the folder ``suite``, and its subfolders that are captures
+    (`is_capture`).
 
     Raises: UserError where there are none.
     """
@@ -67,28 +70,31 @@ def find_scenes(suite) -> dict[str, Path]:
     return dict(sorted(found.items()))
 
 
-def check_names(kind, names, there):
-    """Raises: UserError for one of ``names`` (or None) that is not ``there``; ``kind``: what they are, in a word."""
+def check_names(kind: str, names: Sequence[str] | None, there: Collection[str]) -> None:
+    """Check that all ``names`` (None: none) are ``there``; ``kind`` is what they are, in a word. Raises: UserError otherwise."""
     for name in names or ():
         if name not in there:
             raise UserError(f"no {kind} '{name}': choose from {', '.join(there)}")
 
 
-def budget(minutes) -> list[str]:
-    """The overrides that plan a fit to end within ``minutes``; none for None."""
+def budget(minutes: float | None) -> list[str]:
+    """Return the overrides that plan a fit to end within ``minutes``; none for None."""
     return [f"minutes={minutes}", "iterations=null"] if minutes is not None else []
 
 
 def effort(settings: dict) -> str:
-    """The budget of a fit in words."""
+    """Return the budget of a fit with these ``settings``, in words."""
     return f"{settings['iterations']} steps a fit" if settings["iterations"] else f"{settings['minutes']:g} minutes a fit"
 
 
 # ---- Doing it ----
 
 
-def photographs(xml, data, quiet):
-    """A scene's photographs, path-traced first where need be: a digest of all, and a few test views to show."""
+def photographs(xml: str | Path, data: str | Path, quiet: bool) -> tuple[str, list[View]]:
+    """Return a digest of all photographs of a scene, which are path-traced first where need be, and a few of its preview views.
+
+    Raises: UserError for photographs that can't be read.
+    """
     dataset = FitScene.load(xml, data).dataset(quiet)
     digest = hashlib.sha256()
     for view in [*dataset.train, *dataset.test]:
@@ -97,8 +103,9 @@ def photographs(xml, data, quiet):
     return digest.hexdigest(), results.preview_views(results.evaluation_views(dataset))[::2]
 
 
-def check_photographs(folder, digest):
-    """Note what the fits below ``folder`` are of. Raises: UserError where those that are there are of other photographs."""
+def check_photographs(folder: Path, digest: str) -> None:
+    """Note the ``digest`` of what the fits below ``folder`` are of. Raises: UserError where those that are there are of other
+    photographs."""
     path = folder / _DIGEST
     if path.is_file() and path.read_text().strip() != digest:
         raise UserError(f"{folder} holds fits to other photographs: delete it, or choose another --out")
@@ -106,7 +113,7 @@ def check_photographs(folder, digest):
         stream.write(f"{digest}\n".encode())
 
 
-def fit(xml, job, quiet):
+def fit(xml: str | Path, job: Job, quiet: bool) -> None:
     """Do a job, or go on with it. Raises: UserError where it fails, or is stopped."""
     saved = checkpoint.load_latest(job.folder)
     resume = saved is not None and not results.finished(job.folder) and job.has(saved[1]["settings"])
@@ -122,8 +129,8 @@ def fit(xml, job, quiet):
 # ---- What comes out ----
 
 
-def rows_of(jobs, errors) -> list[dict]:
-    """A row (see `tables`) for each fit that is there or was asked for; ``errors``: {folder: what went wrong}."""
+def rows_of(jobs: Sequence[Job], errors: Mapping[Path, str]) -> list[dict]:
+    """Return a row (see `tables`) for each fit that is there or was asked for; ``errors`` is {folder: what went wrong}."""
     rows = []
     for job in jobs:
         error = errors.get(job.folder)
@@ -138,9 +145,11 @@ def rows_of(jobs, errors) -> list[dict]:
     return rows
 
 
-def write_tables(out, name, sections, rows, told) -> list[Path]:
+def write_tables(
+    out: str | Path, name: str, sections: Sequence[str], rows: Sequence[dict], told: dict[str, object]
+) -> list[Path]:
     """Write ``OUT/NAME.md`` (``sections`` of text), ``.csv`` (the ``rows``) and ``.json`` (the rows as ``runs``, and what
-    else is ``told``); returns their paths."""
+    else is ``told``), and return their paths. Raises: UserError where one can't be written."""
     columns = ("scene", "variant", "seed", "status", *FIGURES, *DETAILS, "error")
     paths = []
     for suffix, text in {

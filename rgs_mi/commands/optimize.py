@@ -4,6 +4,7 @@ import shutil
 import sys
 import time
 import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,18 +33,18 @@ _SMOOTHING = 0.95  # of the PSNR that the progress line shows
 
 
 def optimize(
-    path,
+    path: str | Path,
     *,
-    data=None,
-    variables=None,
-    config=None,
-    overrides=(),
-    minutes=None,
-    seed=None,
-    out=None,
-    resume=False,
-    quiet=False,
-    tensorboard=False,
+    data: str | Path | None = None,
+    variables: Mapping[str, str] | None = None,
+    config: str | Path | None = None,
+    overrides: Sequence[str] = (),
+    minutes: float | None = None,
+    seed: int | None = None,
+    out: str | Path | None = None,
+    resume: bool = False,
+    quiet: bool = False,
+    tensorboard: bool = False,
 ) -> Path:
     """Fit the scene at ``path`` and write the run's folder, which is returned.
 
@@ -98,7 +99,7 @@ def _saved(folder, resume):
 
 
 def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = True) -> Fit:
-    """A fit at its beginning."""
+    """Return the fit of a ``scene`` to the photographs of ``dataset``, at its beginning."""
     begin = settings.initialization
     points = initial_points(dataset, begin.surfels, settings.seed, begin.hull, begin.carve, quiet)
     random = points[1] is None and not (dataset.points is not None and len(dataset.points))

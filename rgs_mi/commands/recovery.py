@@ -2,7 +2,7 @@
 lights. What `rgs-mi recovery` calls.
 
     OUT/recovery.json       the figures below
-    OUT/relit_NAME.png      a few views under each light: the truth, the fit, three times their difference
+    OUT/relit_NAME.png      a few views under each light: ground truth, fit, three times their difference
 
     environment_log_rmse    of log radiance, up to a factor a channel, along the directions that test views reflect, where
                             nothing of the object lies in between, and as blurred as their roughness sees it
@@ -11,6 +11,7 @@ lights. What `rgs-mi recovery` calls.
     relit                   name -> mean psnr and ssim of the fit under that light, as it is
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import drjit as dr
@@ -23,6 +24,7 @@ from ..core.runtime import cache_folder
 from ..core.scene_files import load_scene, spp_of
 from ..datasets import load_dataset
 from ..datasets.path_traced import render_dataset
+from ..datasets.types import View
 from ..evaluation import metrics
 from ..evaluation.evaluate import ground_truth
 from ..export.mitsuba_scene import SCENE
@@ -33,14 +35,22 @@ from ..report.results import preview_views
 from ..shading.environment import Environment
 
 RECOVERY = "recovery.json"
-_VIEWS = 12  # of the truth under each light
+_VIEWS = 12  # of the ground truth under each light
 _WHITE = 1.0
 _ABOVE = 1e-3  # of the diagonal of the object's box
 
 
-def recovery(run, truth, lights=(), *, size=400, out=None, quiet=False) -> dict:
-    """The figures of the fit in the folder ``run``, whose photographs are of the scene file ``truth``, also under other
-    ``lights``, environments of the suite.
+def recovery(
+    run: str | Path,
+    ground_truth_scene: str | Path,
+    lights: Sequence[str] = (),
+    *,
+    size: int = 400,
+    out: str | Path | None = None,
+    quiet: bool = False,
+) -> dict:
+    """Compare the fit in the folder ``run`` with the scene file that its photographs are of, also under other ``lights``,
+    environments of the suite; write the module's files and return what recovery.json holds.
 
     Args:
       size: pixels along a side of the path-traced views, which are kept in the `cache_folder`
@@ -48,17 +58,17 @@ def recovery(run, truth, lights=(), *, size=400, out=None, quiet=False) -> dict:
 
     Raises: UserError for scenes that do not load, and where a file can't be written.
     """
-    run, truth = Path(run), Path(truth)
+    run, true_path = Path(run), Path(ground_truth_scene)
     out = Path(out) if out else run / "recovery"
     path = run / SCENE
-    scene, true_scene = load_scene(path, {}), load_scene(truth, {})
+    scene, true_scene = load_scene(path, {}), load_scene(true_path, {})
     surfels_of(scene, path)
-    own = _views(truth, {}, size, quiet)
+    own = _views(true_path, {}, size, quiet)
     figures: dict = _materials(scene, path, own)
     relit_scores = {}
     figures["environment_log_rmse"] = _environment(scene, true_scene, own)
     for light in lights:
-        views = _views(truth, {"environment": light}, size, quiet)
+        views = _views(true_path, {"environment": light}, size, quiet)
         relit = load_scene(path, {})
         relight(relit, path, light)
         relit_scores[light] = _compare(relit, views, out / f"relit_{light}.png")
@@ -67,10 +77,10 @@ def recovery(run, truth, lights=(), *, size=400, out=None, quiet=False) -> dict:
     return figures
 
 
-def _views(truth, variables, size, quiet):
-    """Path-traced views of the scene with its light, or another."""
-    folder = cache_folder("-".join([truth.stem, "truth", *variables.values()]))
-    render_dataset(truth, folder, train=1, test=_VIEWS, size=size, variables=variables, quiet=quiet)
+def _views(path, variables, size, quiet):
+    """Path-traced views of the scene file ``path`` with its light, or another."""
+    folder = cache_folder("-".join([path.stem, "truth", *variables.values()]))
+    render_dataset(path, folder, train=1, test=_VIEWS, size=size, variables=variables, quiet=quiet)
     return load_dataset(folder).test
 
 
@@ -93,8 +103,9 @@ def _compare(scene, views, picture):
     return dict(zip(("psnr", "ssim"), np.mean(scores, 0).tolist()))
 
 
-def true_maps(view) -> dict[str, np.ndarray]:
-    """What `render_dataset` knows of a view: name -> [H, W, channels]: Normal, Albedo, Roughness, Metallic, Alpha, Depth."""
+def true_maps(view: View) -> dict[str, np.ndarray]:
+    """Return the maps that `render_dataset` wrote beside a view, name -> [H, W, channels]: Normal (world space), Albedo,
+    Roughness, Metallic, Alpha, Depth (along the viewing axis, world units)."""
     bitmap = mi.Bitmap(str(view.path.with_name(view.path.stem + "_aov.exr")))
     channels = {field.name: np.array(bitmap)[..., k] for k, field in enumerate(bitmap.struct_())}
     names = dict.fromkeys(name.split(".")[0] for name in channels)
@@ -149,8 +160,8 @@ def _vectors(v):
     return mi.Vector3f(*map(as_float, v.T))
 
 
-def hidden(scene, point, normal, direction):
-    """[N] whether something of the ``scene`` is in the way from ``point`` along ``direction`` (all [N, 3]). Points are means
-    over pixels, some beneath the surface, so rays start a little above it."""
+def hidden(scene: "mi.Scene", point: np.ndarray, normal: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Return [N] whether something of the ``scene`` is in the way from ``point`` along ``direction`` (all [N, 3], world space).
+    Points are means over pixels, some beneath the surface, so rays start a little above it."""
     above = point + normal * (_ABOVE * float(dr.norm(scene.bbox().extents())))
     return scene.ray_test(mi.Ray3f(mi.Point3f(_vectors(above)), _vectors(direction))).numpy()

@@ -1,4 +1,4 @@
-"""A suite of captures, each fitted once and judged on its held-out views: tables beside the paper's, and a page. What
+"""A suite of captures, each fitted once and evaluated on its held-out views: tables beside the paper's, and a page. What
 `rgs-mi benchmark suite` calls.
 
     OUT/suite.md, .csv, .json     the paper's tables with ours beside them, every scene's figures; written after each fit
@@ -7,6 +7,7 @@
 """
 
 import sys
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -25,8 +26,17 @@ _REMARK = (
 )
 
 
-def plan(root, xml, *, scenes=None, config=None, minutes=None, overrides=(), out) -> list[Job]:
-    """The fits of all scenes (arguments: see `fit_suite`).
+def plan(
+    root: str | Path,
+    xml: str | Path,
+    *,
+    scenes: Sequence[str] | None = None,
+    config: str | Path | None = None,
+    minutes: float | None = None,
+    overrides: Sequence[str] = (),
+    out: str | Path,
+) -> list[Job]:
+    """Return the fits of all scenes (arguments: see `fit_suite`).
 
     Raises: UserError for a scene or setting that does not exist.
     """
@@ -51,7 +61,16 @@ def plan(root, xml, *, scenes=None, config=None, minutes=None, overrides=(), out
 
 
 def fit_suite(
-    root, xml, *, scenes=None, config=None, minutes=None, overrides=(), workers=1, out="runs/suite", quiet=False
+    root: str | Path,
+    xml: str | Path,
+    *,
+    scenes: Sequence[str] | None = None,
+    config: str | Path | None = None,
+    minutes: float | None = None,
+    overrides: Sequence[str] = (),
+    workers: int = 1,
+    out: str | Path = "runs/suite",
+    quiet: bool = False,
 ) -> int:
     """Fit the scenes that are not yet fitted; write the tables and the page (see the module). Ctrl-C saves; the same call
     then goes on.

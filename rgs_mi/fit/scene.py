@@ -1,7 +1,7 @@
 """What there is to fit: a Mitsuba scene whose surfels name photographs, and the YAML beside it that says how."""
 
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,9 +43,11 @@ class FitScene:
     shading: Shading
 
     @classmethod
-    def load(cls, path: str | Path, data: str | Path | None = None, variables: dict | None = None) -> "FitScene":
-        """``data``: the scene's variable of that name, relative to the current folder (`None`: as the scene has it,
-        relative to the scene).
+    def load(
+        cls, path: str | Path, data: str | Path | None = None, variables: Mapping[str, object] | None = None
+    ) -> "FitScene":
+        """Load the scene file ``path``; ``data`` is its variable of that name, relative to the current folder (None: as the
+        scene has it, relative to the scene).
 
         Raises: UserError for a scene that does not load, without photographs, or with a sensor that surfels can't take.
         """
@@ -74,17 +76,17 @@ class FitScene:
 
     @staticmethod
     def integrator_element(root: ET.Element) -> ET.Element | None:
-        """The element of the integrator in the XML, or None."""
+        """Return the element of the integrator in the XML, or None."""
         return root.find("integrator[@type='rgs_deferred']")
 
     @staticmethod
     def surfels_element(root: ET.Element) -> ET.Element | None:
-        """The element of the surfels in the XML, or None."""
+        """Return the element of the surfels in the XML, or None."""
         return root.find("shape[@type='surfels']")
 
     @staticmethod
     def emitter_element(root: ET.Element) -> ET.Element | None:
-        """The element of the environment in the XML, or None."""
+        """Return the element of the environment in the XML, or None."""
         return next((e for e in root.findall("emitter") if e.get("type") in _ENVIRONMENTS), None)
 
     @property
@@ -96,13 +98,17 @@ class FitScene:
         return given.stem if given.suffix == ".xml" else given.name
 
     def settings(self, config: str | Path | None = None, overrides: Sequence[str] = ()) -> Settings:
-        """Defaults, then the YAML beside the scene, ``config`` (a preset or file), and ``overrides`` ('a.b=value')."""
+        """Return the settings: defaults, over them the YAML beside the scene, ``config`` (a preset or file), and ``overrides``
+        ('a.b=value'). Raises: UserError as `load_config` does."""
         beside = self.path.with_suffix(".yaml")
         sources = [beside.absolute()] if beside.is_file() else []
         return load_config(Settings, [*sources, *([config] if config else [])], overrides)
 
     def dataset(self, quiet: bool = False) -> Dataset:
-        """The photographs; those of a scene are path-traced on first use, which takes minutes."""
+        """Return the photographs; those of a scene are path-traced on first use, which takes minutes.
+
+        Raises: UserError for photographs that can't be read.
+        """
         folder = self.photographs
         if folder.suffix == ".xml":
             folder = render_dataset(folder, cache_folder(folder.stem), quiet=quiet)

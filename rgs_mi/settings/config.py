@@ -8,9 +8,10 @@ import difflib
 import json
 import os
 import re
+from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import yaml
 from pydantic import TypeAdapter, ValidationError
@@ -22,7 +23,7 @@ from .fields import expected, fields, section, section_at, walk
 T = TypeVar("T")
 
 
-def load_config(cls: type[T], sources=(), overrides=()) -> T:
+def load_config(cls: type[T], sources: Iterable[str | Path] = (), overrides: Iterable[str] = ()) -> T:
     """An instance of the model ``cls``: its defaults, then each source, then each override; the later wins.
 
     Args:
@@ -50,7 +51,7 @@ def load_config(cls: type[T], sources=(), overrides=()) -> T:
     return config
 
 
-def to_dict(config) -> dict:
+def to_dict(config: Any) -> dict:
     """The settings as nested dicts, lists, numbers and strings, for JSON."""
     return TypeAdapter(type(config)).dump_python(config, mode="json")
 

@@ -1,7 +1,7 @@
 """What the models of settings say, in words: for messages, ``--help`` and the documentation."""
 
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -29,7 +29,7 @@ class Setting:
     section: type | None
 
 
-def fields(cls, prefix="") -> Iterator[Setting]:
+def fields(cls: Any, prefix: str = "") -> Iterator[Setting]:
     """The settings of the model ``cls`` itself, keys after ``prefix``."""
     for name, field in cls.__pydantic_fields__.items():
         low, high = _bounds(field.annotation, field.metadata)
@@ -43,7 +43,7 @@ def fields(cls, prefix="") -> Iterator[Setting]:
         )
 
 
-def walk(cls, prefix="") -> Iterator[Setting]:
+def walk(cls: Any, prefix: str = "") -> Iterator[Setting]:
     """All settings of the model ``cls`` and of its sections, which are left out themselves."""
     for setting in fields(cls, prefix):
         if setting.section:
@@ -52,18 +52,18 @@ def walk(cls, prefix="") -> Iterator[Setting]:
             yield setting
 
 
-def section(annotation) -> type | None:
+def section(annotation: Any) -> type | None:
     """The model that ``annotation`` is, or is optionally."""
     return next((a for a in (annotation, *_alternatives(annotation)) if isinstance(a, type) and is_dataclass(a)), None)
 
 
-def expected(cls, location) -> str:
+def expected(cls: Any, location: Sequence[str | int]) -> str:
     """What must stand at ``location`` in the model ``cls``, a tuple of keys and indices; '' where there is nothing."""
     found = _at(cls, location)
     return ", ".join(filter(None, (kind(found[0]), _range(*_bounds(*found))))) if found else ""
 
 
-def section_at(cls, location) -> type | None:
+def section_at(cls: Any, location: Sequence[str | int]) -> type | None:
     """The model at ``location`` in the model ``cls``; None where something else stands."""
     found = _at(cls, location)
     return section(found[0]) if found else None
@@ -86,7 +86,7 @@ def _at(annotation, location, metadata=()):
     return _at(items[0 if Ellipsis in items else step], rest)
 
 
-def kind(annotation) -> str:
+def kind(annotation: Any) -> str:
     """A type hint in words."""
     annotation, items = _bare(annotation), get_args(_bare(annotation))
     if annotation is types.NoneType:
@@ -103,7 +103,7 @@ def kind(annotation) -> str:
     return _NAMES[annotation][0]
 
 
-def in_yaml(value) -> str:
+def in_yaml(value: Any) -> str:
     """A value as one writes it in YAML."""
     if value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()

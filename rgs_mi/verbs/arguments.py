@@ -3,10 +3,15 @@
 import argparse
 import shutil
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from ..core.errors import listed
 from ..core.scene_files import bundled
+
+#: What a verb does with its arguments: returns the exit code, or None for 0.
+Run = Callable[[argparse.Namespace], int | None]
 
 
 class Parser(argparse.ArgumentParser):
@@ -14,7 +19,7 @@ class Parser(argparse.ArgumentParser):
 
     shows_settings = False
 
-    def format_help(self):
+    def format_help(self) -> str:
         return super().format_help() + (_settings_help() if self.shows_settings else "")
 
 
@@ -31,31 +36,33 @@ def _settings_help():
     return "\n".join(["\nsettings, which --set and YAML files change:", *entries, ""])
 
 
-def add_common(parser, quiet=True):
+def add_common(parser: argparse.ArgumentParser, quiet: bool = True) -> None:
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: %(default)s)")
     if quiet:
         parser.add_argument("--quiet", action="store_true", help="no progress")
 
 
-def add_integer(parser, name, default, text):
+def add_integer(parser: argparse.ArgumentParser, name: str, default: int, text: str) -> None:
     parser.add_argument(name, type=int, default=default, help=f"{text} (default: %(default)s)".strip())
 
 
-def add_names(parser, name, text, kind: type = str, metavar="A,B", **options):
+def add_names(
+    parser: argparse.ArgumentParser, name: str, text: str, kind: type = str, metavar: str = "A,B", **options: Any
+) -> None:
     parser.add_argument(name, type=listed(kind), metavar=metavar, help=text, **options)
 
 
-def add_out(parser, default, text):
+def add_out(parser: argparse.ArgumentParser, default: str, text: str) -> None:
     parser.add_argument("--out", type=Path, default=Path(default), metavar="DIR", help=f"{text} (default: %(default)s)")
 
 
-def add_variables(parser):
+def add_variables(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-D", dest="define", action="append", default=[], metavar="NAME=VALUE", help="a variable of the scene"
     )
 
 
-def add_budget(parser, config=True):
+def add_budget(parser: Parser, config: bool = True) -> None:
     """What says how to fit."""
     parser.shows_settings = True
     if config:
@@ -64,13 +71,13 @@ def add_budget(parser, config=True):
     add_set(parser)
 
 
-def add_set(parser):
+def add_set(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", dest="overrides", action="append", default=[], metavar="A.B=VALUE", help="one setting (see below)"
     )
 
 
-def check_settings(args):
+def check_settings(args: argparse.Namespace) -> None:
     """Refuse bad settings before Mitsuba starts."""
     from ..settings.config import load_config
     from ..settings.settings import Settings
@@ -79,6 +86,6 @@ def check_settings(args):
     load_config(Settings, [config] if config else [], args.overrides)
 
 
-def known(kind) -> str:
+def known(kind: str) -> str:
     """The names of what comes with the package, in words."""
     return ", ".join(bundled(kind))

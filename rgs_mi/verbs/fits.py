@@ -6,10 +6,10 @@ from pathlib import Path
 from ..core.errors import parse_variables
 from ..core.runtime import set_variant
 from ..core.scene_files import find_scene
-from .arguments import add_budget, add_common, add_integer, add_names, add_variables, check_settings, known
+from .arguments import Parser, Run, add_budget, add_common, add_integer, add_names, add_variables, check_settings, known
 
 
-def optimize(parser):
+def optimize(parser: Parser) -> Run:
     """Fit reflective surfels and their environment to photographs, and write a scene that Mitsuba renders."""
     parser.add_argument(
         "scene", help=f"what to fit: {known('scenes')}, or an XML file; a YAML of the same name beside it says how"
@@ -49,7 +49,7 @@ def optimize(parser):
     return run
 
 
-def evaluate(parser):
+def evaluate(parser: Parser) -> Run:
     """Judge a run again on its held-out views, as when LPIPS's weights were installed after it; writes metrics.json anew."""
     parser.add_argument("run_folder", type=Path, metavar="RUN", help="a run's folder")
     parser.add_argument("--data", type=Path, metavar="DIR", help="the folder of its photographs (default: where they were)")
@@ -64,7 +64,7 @@ def evaluate(parser):
     return run
 
 
-def recovery(parser):
+def recovery(parser: Parser) -> Run:
     """How true a fit's light and materials are, against the path-traced scene that it was fitted to, also under other lights."""
     parser.add_argument("run_folder", type=Path, metavar="RUN", help="a run's folder")
     parser.add_argument("truth", help=f"the scene of its photographs: an XML file, or {known('targets')}")

@@ -5,10 +5,10 @@ from pathlib import Path
 from ..core.errors import parse_variables
 from ..core.runtime import CACHE_VARIABLE, cache_folder, set_variant
 from ..core.scene_files import find_scene
-from .arguments import add_common, add_integer, add_variables, known
+from .arguments import Parser, Run, add_common, add_integer, add_variables, known
 
 
-def render(parser):
+def render(parser: Parser) -> Run:
     """Render a fitted scene from one of its views, along them or from a turntable; under another light or with another
     material."""
     parser.add_argument("scene", metavar="RUN_OR_SCENE", help=f"a run's folder, an XML file, or {known('scenes')}")
@@ -77,7 +77,7 @@ def render(parser):
     return run
 
 
-def render_dataset(parser):
+def render_dataset(parser: Parser) -> Run:
     """Path-trace a Mitsuba scene into a data set in the Blender layout: photographs, cameras, normals and other maps."""
     parser.add_argument("scene", help=f"an XML file, or {known('targets')}")
     parser.add_argument(

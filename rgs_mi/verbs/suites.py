@@ -4,10 +4,10 @@ from pathlib import Path
 
 from ..core.runtime import set_variant
 from ..core.scene_files import bundled, find_scene
-from .arguments import Parser, add_budget, add_common, add_integer, add_names, add_out, add_set, check_settings
+from .arguments import Parser, Run, add_budget, add_common, add_integer, add_names, add_out, add_set, check_settings
 
 
-def ablate(parser):
+def ablate(parser: Parser) -> Run:
     """Fit variants of the method to a suite of scenes, and table what each part of it brings. The same command goes on where it
     was interrupted, and does not repeat what is done."""
     _suite_of(parser, "suite")
@@ -28,7 +28,7 @@ def ablate(parser):
     return run
 
 
-def _suite_of(parser, name):
+def _suite_of(parser: Parser, name: str):
     parser.add_argument(
         name,
         type=Path,
@@ -40,7 +40,7 @@ def _suite_of(parser, name):
     add_names(parser, "--scenes", "these only")
 
 
-def benchmark(parser):
+def benchmark(parser: Parser) -> Run:
     """Fit and judge a suite of captures beside the paper's tables; or time the splatter, or the step of a fit."""
     commands = parser.add_subparsers(dest="command", required=True, parser_class=Parser)
     for define in (_suite, _splat, _step):
@@ -51,7 +51,7 @@ def benchmark(parser):
     return lambda args: args.measure(args)
 
 
-def _suite(parser):
+def _suite(parser: Parser) -> Run:
     """Fit and judge all captures of a folder; the same command goes on where it was interrupted, and does not repeat what is
     done. On a cluster: one job a scene with --scenes NAME, all with the same settings and --out, and at last the same without
     --scenes for the tables."""
@@ -71,7 +71,7 @@ def _suite(parser):
     return run
 
 
-def _splat(parser):
+def _splat(parser: Parser) -> Run:
     """Tile intersections, forward and backward of random surfels on a sphere."""
     add_integer(parser, "--surfels", 50_000, "")
     add_integer(parser, "--res", 800, "pixels along a side")
@@ -92,7 +92,7 @@ def _splat(parser):
     return run
 
 
-def _step(parser):
+def _step(parser: Parser) -> Run:
     """A warm step at full resolution."""
     parser.add_argument("--scene", default="object", help="what to fit (default: %(default)s)")
     parser.add_argument("--data", required=True, help="a capture's folder, or one of our targets")
@@ -112,7 +112,7 @@ def _step(parser):
     return run
 
 
-def crossvalidate(parser):
+def crossvalidate(parser: Parser) -> Run:
     """Compare our estimators of what a principled BSDF reflects with Mitsuba's path tracer; 1 where a bound is broken."""
     add_names(parser, "--shapes", "sphere, and models of the suite, e.g. helmet (default: sphere)", default=["sphere"])
     add_names(parser, "--environments", "of the suite (default: three)")
@@ -134,7 +134,7 @@ def crossvalidate(parser):
     return run
 
 
-def fit_taps(parser):
+def fit_taps(parser: Parser) -> Run:
     """Fit where split-sum looks the environment up (rgs_mi/shading/taps.npy) to the Monte Carlo estimator; minutes."""
     add_integer(parser, "--environments", 24, "random ones to fit to")
     add_integer(parser, "--steps", 1500, "of the optimiser")
