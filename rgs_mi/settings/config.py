@@ -8,9 +8,10 @@ import difflib
 import json
 import os
 import re
+from collections.abc import Iterable
 from importlib import resources
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import yaml
 from pydantic import TypeAdapter, ValidationError
@@ -22,8 +23,8 @@ from .fields import expected, fields, section, section_at, walk
 T = TypeVar("T")
 
 
-def load_config(cls: type[T], sources=(), overrides=()) -> T:
-    """An instance of the model ``cls``: its defaults, then each source, then each override; the later wins.
+def load_config(cls: type[T], sources: Iterable[str | Path] = (), overrides: Iterable[str] = ()) -> T:
+    """Make an instance of the model ``cls``: its defaults, then each source, then each override; the later wins.
 
     Args:
       cls:       a frozen pydantic dataclass, all of whose fields have defaults
@@ -50,13 +51,13 @@ def load_config(cls: type[T], sources=(), overrides=()) -> T:
     return config
 
 
-def to_dict(config) -> dict:
-    """The settings as nested dicts, lists, numbers and strings, for JSON."""
+def to_dict(config: object) -> dict[str, Any]:
+    """Return the settings ``config`` as nested dictionaries, lists, numbers and strings, for JSON."""
     return TypeAdapter(type(config)).dump_python(config, mode="json")
 
 
 def presets() -> list[str]:
-    """Names of the presets that the package ships."""
+    """Return the names of the presets that the package ships."""
     return sorted(p.name[:-5] for p in _preset_folder().iterdir() if p.name.endswith(".yaml"))
 
 
@@ -87,8 +88,8 @@ def _read(source):
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML with the scalars of version 1.2: 1e-3 is a number, 3e4 an integer, and ``off``, 1:30 and 2026-01-01 are strings. A
-    key that appears twice is an error, and so is an alias, which could contain itself."""
+    """YAML with the scalars of version 1.2: 1e-3 is a number, 3e4 an integer, and ``off``, 1:30 and 2026-01-01 are strings.
+    A key that appears twice is an error, and so is an alias, which could contain itself."""
 
     yaml_implicit_resolvers = {}
 
@@ -188,7 +189,9 @@ def _message(cls, error: ErrorDetails) -> str:
 def _suggestion(cls, key, location):
     """A key beside, or else one anywhere, that is spelled alike; or all keys beside."""
     prefix, name = key.removesuffix(str(location[-1])), str(location[-1])
-    beside = [setting.key.removeprefix(prefix) for setting in fields(section_at(cls, location[:-1]), prefix)]
+    model = section_at(cls, location[:-1])
+    assert model is not None, "keys are unknown to models alone"
+    beside = [setting.key.removeprefix(prefix) for setting in fields(model, prefix)]
     if near := difflib.get_close_matches(name, beside, 1):
         return f"did you mean '{prefix}{near[0]}'?"
     known = [setting.key for setting in (*walk(cls), *fields(cls))]

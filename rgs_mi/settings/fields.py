@@ -1,7 +1,7 @@
 """What the models of settings say, in words: for messages, ``--help`` and the documentation."""
 
 import types
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -29,8 +29,8 @@ class Setting:
     section: type | None
 
 
-def fields(cls, prefix="") -> Iterator[Setting]:
-    """The settings of the model ``cls`` itself, keys after ``prefix``."""
+def fields(cls: type, prefix: str = "") -> Iterator[Setting]:
+    """Yield the settings of the model ``cls`` itself, their keys after ``prefix``."""
     for name, field in cls.__pydantic_fields__.items():
         low, high = _bounds(field.annotation, field.metadata)
         yield Setting(
@@ -43,8 +43,8 @@ def fields(cls, prefix="") -> Iterator[Setting]:
         )
 
 
-def walk(cls, prefix="") -> Iterator[Setting]:
-    """All settings of the model ``cls`` and of its sections, which are left out themselves."""
+def walk(cls: type, prefix: str = "") -> Iterator[Setting]:
+    """Yield all settings of the model ``cls`` and of its sections, which are left out themselves."""
     for setting in fields(cls, prefix):
         if setting.section:
             yield from walk(setting.section, f"{setting.key}.")
@@ -52,19 +52,19 @@ def walk(cls, prefix="") -> Iterator[Setting]:
             yield setting
 
 
-def section(annotation) -> type | None:
-    """The model that ``annotation`` is, or is optionally."""
+def section(annotation: Any) -> type | None:
+    """Return the model that ``annotation`` is, or is optionally; None where it is none."""
     return next((a for a in (annotation, *_alternatives(annotation)) if isinstance(a, type) and is_dataclass(a)), None)
 
 
-def expected(cls, location) -> str:
-    """What must stand at ``location`` in the model ``cls``, a tuple of keys and indices; '' where there is nothing."""
+def expected(cls: type, location: Sequence[str | int]) -> str:
+    """Return in words what must stand at ``location``, keys and indices, in the model ``cls``; '' where there is nothing."""
     found = _at(cls, location)
     return ", ".join(filter(None, (kind(found[0]), _range(*_bounds(*found))))) if found else ""
 
 
-def section_at(cls, location) -> type | None:
-    """The model at ``location`` in the model ``cls``; None where something else stands."""
+def section_at(cls: type, location: Sequence[str | int]) -> type | None:
+    """Return the model at ``location`` in the model ``cls``; None where something else stands."""
     found = _at(cls, location)
     return section(found[0]) if found else None
 
@@ -86,8 +86,8 @@ def _at(annotation, location, metadata=()):
     return _at(items[0 if Ellipsis in items else step], rest)
 
 
-def kind(annotation) -> str:
-    """A type hint in words."""
+def kind(annotation: Any) -> str:
+    """Return a type hint in words."""
     annotation, items = _bare(annotation), get_args(_bare(annotation))
     if annotation is types.NoneType:
         return "null"
@@ -103,8 +103,8 @@ def kind(annotation) -> str:
     return _NAMES[annotation][0]
 
 
-def in_yaml(value) -> str:
-    """A value as one writes it in YAML."""
+def in_yaml(value: object) -> str:
+    """Return a value as one writes it in YAML."""
     if value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()
     if isinstance(value, tuple | list):
