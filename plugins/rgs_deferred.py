@@ -128,8 +128,8 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         develop: bool = True,
         evaluate: bool = True,
     ) -> "mi.TensorXf":
-        """Return the image [height, width, channels] that ``sensor`` sees, linear radiance, and put it on its film; ``spp`` 0
-        means as many samples per pixel as its sampler has.
+        """Return the image [height, width, channels] that ``sensor`` sees, linear radiance, and put it on its film; ``spp``
+        0 means as many samples per pixel as its sampler has.
 
         Raises: UserError for a film of another type than 'hdrfilm', and for a scene that can't be shaded.
         """
@@ -205,7 +205,8 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         environment: FilteredEnvironment | None,
         seed: "mi.UInt32 | int",
     ) -> Lighting | None:
-        """Return by what `deferred.shade` shades ``surfels`` in the ``scene``, whose `environment` this is; None: nothing."""
+        """Return by what `deferred.shade` shades ``surfels`` in the ``scene``, whose `environment` this is; None
+        stands for nothing."""
         shading = Shading(self.specular, self.diffuse, self.samples, eta, self.box, self.indirect)
         return lighting_of(shading, surfels, environment, scene.environment(), self.shader, seed)
 

@@ -25,7 +25,8 @@ from .jobs import Job, budget, check_names, check_photographs, effort, find_scen
 @dataclass(frozen=True)
 class Variant:
     """A variant of the settings: a ``preset`` and ``overrides``. ``label`` is its name in tables; ``against`` is the variant
-    that it is compared with; it is fitted to the first ``scenes`` of a suite (None: to all), unless it is asked for by name."""
+    that it is compared with; it is fitted to the first ``scenes`` of a suite (None: to all), unless it is asked for by
+    name."""
 
     label: str
     preset: str

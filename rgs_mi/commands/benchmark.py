@@ -68,8 +68,8 @@ def sphere(count: int, seed: int = 0) -> Surfels:
 
 
 def splat_times(surfels: Surfels, size: int) -> dict[str, float]:
-    """Return the times of `STAGES` in ms for an image of ``size`` x ``size`` pixels: the intersections of tiles, compositing, and
-    its derivative by geometry and features."""
+    """Return the times of `STAGES` in ms for an image of ``size`` x ``size`` pixels: the intersections of tiles,
+    compositing, and its derivative by geometry and features."""
     camera = Camera.look_at((0, 0, 4), (0, 0, 0), (0, 1, 0), _FOV, (size, size))
     rng = np.random.default_rng(1)
     projected = project(surfels, camera)

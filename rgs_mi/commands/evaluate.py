@@ -1,5 +1,5 @@
-"""A run evaluated again on the photographs that it held out: when LPIPS's weights were installed later, or on another machine.
-What `rgs-mi evaluate` calls.
+"""A run evaluated again on the photographs that it held out: when LPIPS's weights were installed later, or on another
+machine. What `rgs-mi evaluate` calls.
 
 What is evaluated is the scene that the run exported, not a checkpoint of the fit: it is what people use and pass on, says by
 itself how it is shaded, and is there when checkpoints are deleted. Both give the same figures, to rounding.

@@ -25,7 +25,7 @@ _MATERIALS = ((0.0, 0.0), (1.0, 1.0), (0.0, 0.0), (1.0, 0.5), (0.0, 0.0), (1.0, 
 
 @dataclass
 class Samples:
-    """``surfaces``, the arguments of an estimator, in one ``environment``, and the linear radiance that they truly reflect."""
+    """Surfaces, as the arguments of an estimator, in one ``environment``, and the linear radiance that they truly reflect."""
 
     environment: FilteredEnvironment
     surfaces: tuple
@@ -37,8 +37,8 @@ class Samples:
 
 
 def fit_taps(path: str | Path, environments: int, steps: int, seed: int) -> None:
-    """Fit a table of taps to so many random ``environments``, write it to ``path``, and print the error in environments that it
-    was not fitted to.
+    """Fit a table of taps to so many random ``environments``, write it to ``path``, and print the error in environments that
+    it was not fitted to.
 
     Raises: UserError where the file can't be written.
     """

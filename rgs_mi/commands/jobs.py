@@ -29,8 +29,8 @@ _DIGEST = "photographs.sha256"  # beside or above the fits: what they are of
 @dataclass(frozen=True)
 class Job:
     """One fit to the photographs ``data`` of ``scene``, into ``folder``: ``overrides`` over ``config`` (a preset, a file or
-    None), which make ``settings`` (nested dicts); ``variant`` and ``seed`` are what tables call it by. ``asked`` says whether
-    it is to be done now; of other jobs, tables have what is there."""
+    None), which make ``settings`` (nested dicts); ``variant`` and ``seed`` are what tables call it by. ``asked`` says
+    whether it is to be done now; of other jobs, tables have what is there."""
 
     scene: str
     data: Path
@@ -71,7 +71,8 @@ def find_scenes(suite: str | Path) -> dict[str, Path]:
 
 
 def check_names(kind: str, names: Sequence[str] | None, there: Collection[str]) -> None:
-    """Check that all ``names`` (None: none) are ``there``; ``kind`` is what they are, in a word. Raises: UserError otherwise."""
+    """Check that all ``names`` (None: none) are ``there``; ``kind`` is what they are, in a word. Raises: UserError
+    otherwise."""
     for name in names or ():
         if name not in there:
             raise UserError(f"no {kind} '{name}': choose from {', '.join(there)}")
@@ -91,7 +92,8 @@ def effort(settings: dict) -> str:
 
 
 def photographs(xml: str | Path, data: str | Path, quiet: bool) -> tuple[str, list[View]]:
-    """Return a digest of all photographs of a scene, which are path-traced first where need be, and a few of its preview views.
+    """Return a digest of all photographs of a scene, which are path-traced first where need be, and a few of its preview
+    views.
 
     Raises: UserError for photographs that can't be read.
     """
@@ -104,8 +106,8 @@ def photographs(xml: str | Path, data: str | Path, quiet: bool) -> tuple[str, li
 
 
 def check_photographs(folder: Path, digest: str) -> None:
-    """Note the ``digest`` of what the fits below ``folder`` are of. Raises: UserError where those that are there are of other
-    photographs."""
+    """Note the ``digest`` of what the fits below ``folder`` are of. Raises: UserError where those that are there are of
+    other photographs."""
     path = folder / _DIGEST
     if path.is_file() and path.read_text().strip() != digest:
         raise UserError(f"{folder} holds fits to other photographs: delete it, or choose another --out")

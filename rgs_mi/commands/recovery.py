@@ -161,7 +161,7 @@ def _vectors(v):
 
 
 def hidden(scene: "mi.Scene", point: np.ndarray, normal: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Return [N] whether something of the ``scene`` is in the way from ``point`` along ``direction`` (all [N, 3], world space).
-    Points are means over pixels, some beneath the surface, so rays start a little above it."""
+    """Return [N] whether something of the ``scene`` is in the way from ``point`` along ``direction`` (all [N, 3], world
+    space). Points are means over pixels, some beneath the surface, so rays start a little above it."""
     above = point + normal * (_ABOVE * float(dr.norm(scene.bbox().extents())))
     return scene.ray_test(mi.Ray3f(mi.Point3f(_vectors(above)), _vectors(direction))).numpy()

@@ -3,6 +3,7 @@
 import os
 import struct
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +29,8 @@ _COLMAP_POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("
 _COLMAP_TRACK_ITEM = 8  # bytes: int32 image, int32 keypoint
 
 
-def sparse_points(root: Path, files=FILES) -> tuple[np.ndarray, np.ndarray | None] | None:
-    """The points of the first of ``files`` that folder ``root`` has, in the file's own world frame.
+def sparse_points(root: str | Path, files: Sequence[str] = FILES) -> tuple[np.ndarray, np.ndarray | None] | None:
+    """Read the points of the first of ``files`` that folder ``root`` has, in the file's own world frame.
 
     Returns: positions [N, 3] float32, N > 0; linear colours [N, 3] float32 in [0, 1], decoded from sRGB, or None where the
     file has none. None without a file.

@@ -1,10 +1,15 @@
 """What people look at: pictures of each test view, panels that take it apart, and one sheet that tells the whole fit."""
 
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
 import numpy as np
 
 from ..core.color import srgb_encode, to_8bit, tone_map
 from ..core.files import write_exr, write_png
 from ..core.sheet import Sheet
+from ..datasets.types import View
 from . import metrics
 from .evaluate import Rendering, ground_truth
 
@@ -25,14 +30,20 @@ _ON_SHEET = (
     "specular",
 )
 
+K = TypeVar("K")
 
-def write_view(folder, view, rendering: Rendering, background, gbuffer: bool):
-    """``NAME.png`` (the rendering), ``NAME_compare.png`` (photograph, rendering, `ERROR_GAIN` times the error), and
-    where asked ``NAME_gbuffer.exr`` (linear maps premultiplied by coverage; normals in world space)."""
-    truth = ground_truth(view, background)
-    error = np.abs(rendering.image - truth) * ERROR_GAIN
+
+def write_view(folder: Path, view: View, rendering: Rendering, background: float, gbuffer: bool) -> None:
+    """Write ``NAME.png`` (the rendering), ``NAME_compare.png`` (photograph, rendering, `ERROR_GAIN` times the error), and
+    where asked ``NAME_gbuffer.exr`` (linear maps premultiplied by coverage; normals in world space). ``background`` is a
+    display-space grey level.
+
+    Raises: UserError where a file can't be written.
+    """
+    expected = ground_truth(view, background)
+    error = np.abs(rendering.image - expected) * ERROR_GAIN
     write_png(folder / f"{view.name}.png", rendering.image)
-    write_png(folder / f"{view.name}_compare.png", np.concatenate([truth, rendering.image, error], 1))
+    write_png(folder / f"{view.name}_compare.png", np.concatenate([expected, rendering.image, error], 1))
     if gbuffer:
         maps = rendering.maps | {"alpha": rendering.alpha}
         names = [
@@ -46,22 +57,22 @@ def write_view(folder, view, rendering: Rendering, background, gbuffer: bool):
 # ---- Panels ----
 
 
-def panels(view, rendering: Rendering, background) -> dict[str, np.ndarray]:
-    """A view taken apart: name -> [H, W, 3] uint8 over white, all cropped to the object.
+def panels(view: View, rendering: Rendering, background: float) -> dict[str, np.ndarray]:
+    """Take a view apart: return name -> [H, W, 3] uint8 over white, all cropped to the object.
 
-    ``ground_truth``, ``rendering``; ``error`` (mean absolute difference of display values, from 0 to `ERROR_RANGE`);
+    There are ``photograph``, ``rendering``; ``error`` (mean absolute difference of display values, from 0 to `ERROR_RANGE`);
     ``normals`` and, where the view has them, ``true normals`` (world space) and ``normal error`` (angle, from 0 to
     `NORMAL_RANGE`); ``depth`` (along the axis, near is light); ``roughness``, ``metallic``, ``base color``; ``diffuse`` and
     ``specular`` radiance, clipped.
     """
-    alpha, maps, truth = rendering.alpha, rendering.maps, ground_truth(view, background)
+    alpha, maps, expected = rendering.alpha, rendering.maps, ground_truth(view, background)
     over_white = lambda premultiplied: premultiplied + (1 - alpha)
     mean = lambda name: maps[name] / np.maximum(alpha, 1e-6)
     light = lambda name: over_white(srgb_encode(np.clip(mean(name), 0, 1)) * alpha)
     images = {
-        "photograph": truth,
+        "photograph": expected,
         "rendering": rendering.image,
-        "error": ramp(np.abs(rendering.image - truth).mean(-1) / ERROR_RANGE),
+        "error": ramp(np.abs(rendering.image - expected).mean(-1) / ERROR_RANGE),
         "normals": metrics.normal_colors(maps["sh_normal"], alpha[..., 0]),
     }
     if view.normal is not None:
@@ -81,7 +92,7 @@ def panels(view, rendering: Rendering, background) -> dict[str, np.ndarray]:
 
 
 def ramp(values: np.ndarray) -> np.ndarray:
-    """Values in [0, 1], any shape, as colours of `RAMP` [..., 3]; what is beyond has the last one."""
+    """Take values in [0, 1], of any shape, to colours of `RAMP` [..., 3]; what is beyond has the last one."""
     return np.stack([np.interp(values, np.linspace(0, 1, len(RAMP)), channel) for channel in RAMP.T], -1)
 
 
@@ -93,8 +104,9 @@ def _nearness(depth, covered):
     return 0.05 + 0.9 * np.clip((far - depth) / max(far - near, 1e-9), 0, 1)
 
 
-def crop(panels, view):
-    """The square around the object where the view has a mask, else the whole."""
+def crop(panels: dict[K, np.ndarray], view: View) -> dict[K, np.ndarray]:
+    """Crop images [H, W, 3] of a ``view`` to the square around the object where it has a mask; else return them as they
+    are."""
     if not view.masked:
         return panels
     y, x = np.nonzero(view.pixels[..., 3])
@@ -107,9 +119,11 @@ def crop(panels, view):
 # ---- The contact sheet ----
 
 
-def contact_sheet(path, rows, environment: np.ndarray, title: str, lines):
-    """One picture of the fit: a row for each view's `panels` of ``rows``; below them the ``environment``
-    [rows, columns, 3] and beside it ``lines`` of text."""
+def contact_sheet(
+    path: str | Path, rows: Sequence[Mapping[str, np.ndarray]], environment: np.ndarray, title: str, lines: Sequence[str]
+) -> None:
+    """Write one picture of the fit: a row for each view's `panels` of ``rows``; below them the ``environment``
+    [rows, columns, 3], linear radiance, and beside it ``lines`` of text. Raises: UserError where it can't be written."""
     names = [name for name in _ON_SHEET if any(name in row for row in rows)]
     line = 2 * _TEXT
     map_height = (len(names) * (_PANEL + _GAP) - _GAP) * 3 // 10

@@ -3,6 +3,7 @@
 import itertools
 import shutil
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,16 +24,17 @@ _COLORS = (
 )
 
 
-def check():
-    """Raises: UserError where the encoder is not installed."""
+def check() -> None:
+    """Check that the encoder is installed. Raises: UserError where it is not."""
     try:
         import imageio_ffmpeg  # noqa: F401
     except ImportError as error:
         raise UserError("a video needs an encoder: pip install imageio-ffmpeg") from error
 
 
-def write(folder, files) -> list[Path]:
-    """Write ``FOLDER/video.mp4`` and ``sheet.png`` of the PNGs ``files``, which have one size; what is transparent is white.
+def write(folder: str | Path, files: Sequence[str | Path]) -> list[Path]:
+    """Write ``FOLDER/video.mp4`` and ``sheet.png`` of the PNGs ``files``, which have one size, and return their paths. What
+    is transparent is white.
 
     The video takes about six seconds where that means 4 to 30 frames in each. Pixels are yuv420p, which needs even sizes:
     odd ones grow by a white row or column.
@@ -47,16 +49,16 @@ def write(folder, files) -> list[Path]:
     return paths
 
 
-def over_white(file) -> np.ndarray:
-    """[H, W, 3] uint8 of a PNG with straight alpha, blended in display space."""
+def over_white(file: str | Path) -> np.ndarray:
+    """Read a PNG with straight alpha over white, blended in display space: [H, W, 3] uint8."""
     with Image.open(file) as image:
         pixels = np.asarray(image.convert("RGBA"), np.float32)
     alpha = pixels[..., 3:] / 255
     return (pixels[..., :3] * alpha + 255 * (1 - alpha) + 0.5).astype(np.uint8)
 
 
-def sheet(frames) -> Sheet:
-    """``frames``, [H, W, 3] uint8 each, row by row."""
+def sheet(frames: Sequence[np.ndarray]) -> Sheet:
+    """Return a contact sheet of ``frames``, [H, W, 3] uint8 each, row by row."""
     return Sheet([frames[k : k + _COLUMNS] for k in range(0, len(frames), _COLUMNS)], _WIDTH, _GAP, margin=_GAP)
 
 

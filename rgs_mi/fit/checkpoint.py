@@ -9,9 +9,12 @@ import os
 import re
 import warnings
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
@@ -20,7 +23,7 @@ KEEP = 2
 _NAME = re.compile(r"step_(\d+)\.npz")
 
 
-def save(folder, arrays: dict, meta: dict) -> Path:
+def save(folder: str | Path, arrays: Mapping[str, npt.ArrayLike], meta: Mapping[str, Any]) -> Path:
     """Write ``FOLDER/checkpoints/step_XXXXXXX.npz`` atomically and return its path.
 
     Keeps the newest two. A checkpoint of a later step belongs to a run that was given up (its file is damaged, or the
@@ -48,10 +51,10 @@ def save(folder, arrays: dict, meta: dict) -> Path:
     return path
 
 
-def load_latest(folder) -> tuple[dict, dict] | None:
-    """``(arrays, meta)`` of the newest readable checkpoint of the run in ``folder``; None where there is none.
+def load_latest(folder: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]] | None:
+    """Return ``(arrays, meta)`` of the newest readable checkpoint of the run in ``folder``; None where there is none.
 
-    Falls back to the one before, with a warning, when the newest is damaged.
+    Where the newest is damaged it warns, and falls back to the one before.
     Raises: UserError where there are checkpoints and none can be read.
     """
     checkpoints = _checkpoints(Path(folder) / "checkpoints")

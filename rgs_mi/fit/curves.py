@@ -15,11 +15,12 @@ from ..core.errors import UserError
 from ..core.files import atomic_file
 
 FILE = "curves.csv"
-STRETCHES = 300  # of equal parts of the budget; a fit has that many rows, or one a step
+STRETCHES = 300  # of equal parts of the budget; a fit has that many rows, or one per step
 
 
 class Curves:
-    """The curves of a fit. ``rows`` are what a checkpoint keeps: a dictionary for each stretch, oldest first, JSON values."""
+    """The curves of a fit. ``rows`` are what a checkpoint keeps: a dictionary for each stretch, oldest first, JSON
+    values."""
 
     def __init__(self, rows: Iterable[dict] = ()) -> None:
         self.rows = list(rows)
@@ -27,8 +28,8 @@ class Curves:
         self._sums: dict[str, tuple[float, int]] = {}  # name -> sum and count over its steps
 
     def add(self, progress: float, state: dict, measured: dict) -> bool:
-        """Note a step: ``state`` as it is now, ``measured`` to be averaged (what is not finite is left out).
-        ``progress``: of the fit, in [0, 1]. Returns whether a stretch is complete, and has become the last of the rows."""
+        """Note a step at the fit's ``progress`` in [0, 1]: ``state`` as it is now, and ``measured``, which is averaged (what
+        is not finite is left out). Return whether a stretch is complete, and has become the last of the rows."""
         for name, value in measured.items():
             if math.isfinite(value):
                 total, count = self._sums.get(name, (0.0, 0))
@@ -41,7 +42,7 @@ class Curves:
         return True
 
     def write(self, folder: Path) -> None:
-        """``FOLDER/curves.csv``. Raises: UserError where the disk is full or the folder can't be written."""
+        """Write ``FOLDER/curves.csv``. Raises: UserError where the disk is full or the folder can't be written."""
         text = io.StringIO()
         names = dict.fromkeys(name for row in self.rows for name in row)
         writer = csv.DictWriter(text, list(names), lineterminator="\n")
@@ -52,7 +53,7 @@ class Curves:
 
     @classmethod
     def read(cls, folder: Path) -> "Curves":
-        """What `write` wrote; empty where there is none. Raises: UserError where it is damaged."""
+        """Read what `write` wrote; the curves are empty where there is none. Raises: UserError where it is damaged."""
         path = folder / FILE
         if not path.is_file():
             return cls()
@@ -63,9 +64,9 @@ class Curves:
             raise UserError(f"{path}: damaged ({error}): delete it, the report then has no curves") from error
 
     def column(self, name: str) -> list[float]:
-        """Its value in each row, NaN where a row has none."""
+        """Return the value of ``name`` in each row, NaN where a row has none."""
         return [row.get(name, math.nan) for row in self.rows]
 
     def losses(self) -> list[str]:
-        """The columns that are parts of the loss."""
+        """Return the names of the columns that are parts of the loss."""
         return list(dict.fromkeys(name for row in self.rows for name in row if name.startswith("loss.")))

@@ -1,4 +1,4 @@
-"""Adaptive density control: clone, split, prune (3DGS § 5, 2DGS). The optimiser's moments follow the surfels."""
+"""Adaptive density control: clone, split, prune (3DGS § 5, 2DGS). The optimizer's moments follow the surfels."""
 
 import drjit as dr
 import mitsuba as mi
@@ -15,29 +15,31 @@ _SPLIT_SCALE = 1.6  # a split surfel's halves are that much smaller (3DGS)
 
 
 class Gradients:
-    """Running mean of the image-plane gradient of each surfel's centre, over the views that saw it."""
+    """The running mean of the image-plane gradient of each surfel's center, over the views that saw it, for ``n``
+    surfels."""
 
     def __init__(self, n: int) -> None:
         self.sum, self.count = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)
 
     def add(self, gradient: "mi.Vector2f", seen: "mi.Bool", size: tuple[int, int]) -> None:
-        """``gradient``: of the loss with respect to the projected centres in pixels, ``mi.Vector2f``; ``seen``: which
-        surfels the view of ``size`` (width, height) listed. Kept in NDC units, as 3DGS measures it; one that overflowed
-        counts as zero."""
+        """Add a view of ``size`` (width, height) that listed the surfels ``seen``; ``gradient`` is that of the loss with
+        respect to the projected centers in pixels, one entry per surfel. It is kept in NDC units, as 3DGS measures it; one
+        that overflowed counts as zero."""
         length = dr.norm(mi.Vector2f(gradient.x * (size[0] / 2), gradient.y * (size[1] / 2)))
         self.sum += dr.select(seen & dr.isfinite(length), length, 0)
         self.count += dr.select(seen, mi.Float(1), 0)
         dr.eval(self.sum, self.count)
 
     def mean(self) -> np.ndarray:
-        """[N]; zero for surfels that no view saw."""
+        """Return the mean [N] of the gradients' lengths in NDC units, zero for surfels that no view saw."""
         return self.sum.numpy() / np.maximum(self.count.numpy(), 1)
 
 
 class DensityControl:
     """Density control of a fit under ``settings``: its statistics, and where views saw something reflective.
 
-    ``extent``: radius of the object in world units; ``box``: around the object where there are surroundings, else None.
+    ``extent`` is the radius of the object in world units, ``box`` is around the object where there are surroundings, else
+    None; ``n`` is the number of surfels.
     """
 
     def __init__(self, settings: Density, extent: float, box: BoundingBox | None, n: int) -> None:
@@ -46,12 +48,13 @@ class DensityControl:
         self.reflective: dict[int, tuple[Camera, np.ndarray]] = {}  # by view: its camera, and boxes of what is reflective
 
     def note_reflective(self, view: int, camera: Camera, mask: np.ndarray) -> None:
-        """Remember what is reflective in a view, where it guides density control; ``mask``: its β̂, [H, W] bool."""
+        """Remember what is reflective in the view of this index, where that guides density control; ``mask`` is its β̂,
+        [H, W] bool."""
         if self.settings.guided:
             self.reflective[view] = camera, boxes(mask)
 
     def guided(self, model: Model) -> np.ndarray | None:
-        """[N] which surfels get half the threshold (RGS, Algorithm 1); None where nothing guides."""
+        """Return [N] which surfels get half the threshold (RGS, Algorithm 1); None where nothing guides."""
         if not self.reflective:
             return None
         return guided(model.numpy("centers"), *zip(*self.reflective.values()))
@@ -78,8 +81,8 @@ def densify(
     budget: int,
     guided: np.ndarray | None = None,
 ) -> None:
-    """One round of density control, in place. ``extent``: radius of the object in world units, or [N] what is large for each
-    surfel; ``settings``: `Density`.
+    """Do one round of density control, in place. ``extent`` is the radius of the object in world units, or [N] what is large
+    for each surfel.
 
     Surfels whose mean gradient exceeds the threshold are cloned when small and split when large, the largest gradients
     first while ``budget`` (surfels in all) lasts; for those that are ``guided`` ([N] bool or None) half the threshold is

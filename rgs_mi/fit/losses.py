@@ -1,4 +1,4 @@
-"""Image losses and geometric regularisers, all on Dr.Jit arrays with one entry per pixel (row-major)."""
+"""Image losses and geometric regularizers, all on Dr.Jit arrays with one entry per pixel (row-major); a loss has width 1."""
 
 import drjit as dr
 import mitsuba as mi
@@ -19,14 +19,14 @@ _FLAT = 1e-6  # standard deviation of a depth map, in units of its depth, up to 
 
 
 def srgb(x: "mi.Color3f") -> "mi.Color3f":
-    """The sRGB curve, continued above one; negative values count as zero."""
+    """Take linear light to display values by the sRGB curve, continued above one; negative values count as zero."""
     x = dr.maximum(x, 0)
     return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * dr.power(dr.maximum(x, 0.0031308), 1 / 2.4) - 0.055)
 
 
 def display(color: "mi.Color3f", alpha: "mi.Float", background: float) -> "mi.Color3f":
-    """Premultiplied linear ``color`` over ``background`` (a display-space grey level) in display space, as data sets with
-    straight alpha are composited: srgb(color / alpha) alpha + background (1 − alpha)."""
+    """Composite premultiplied linear ``color`` over ``background``, a display-space grey level, in display space, as data
+    sets with straight alpha are: srgb(color / alpha) alpha + background (1 − alpha)."""
     covered = alpha > COVERED
     safe = dr.select(covered, alpha, 1)
     return dr.select(covered, srgb(color / safe) * alpha, 0) + background * (1 - alpha)
@@ -68,8 +68,8 @@ class _Blur(dr.CustomOp):
 
 
 def ssim(image: "mi.Color3f", target: "mi.Color3f", size: tuple[int, int]) -> "mi.Float":
-    """Mean structural similarity of two ``mi.Color3f`` images (11 × 11 Gaussian window, σ 1.5), differentiable in the
-    first."""
+    """Return the mean structural similarity of two images of ``size`` (width, height), with an 11 × 11 Gaussian window of σ
+    1.5 (Wang et al. 2004); differentiable in the first."""
     with dr.suspend_grad():
         blurred = dr.custom(_Blur, [*target, *(target * target)], size)
     mu_y, yy = mi.Color3f(*blurred[:3]), mi.Color3f(*blurred[3:])
@@ -81,15 +81,18 @@ def ssim(image: "mi.Color3f", target: "mi.Color3f", size: tuple[int, int]) -> "m
 
 
 def photometric(image: "mi.Color3f", target: "mi.Color3f", size: tuple[int, int], dssim: float) -> "mi.Float":
-    """(1 − λ) L1 + λ (1 − SSIM)/2 with λ = ``dssim`` (3DGS). Where the photograph is saturated a brighter rendering is no
-    error, and a too bright rendering elsewhere still feels its gradient."""
+    """Return (1 − λ) L1 + λ (1 − SSIM)/2 with λ = ``dssim`` (3DGS), of display values.
+
+    Where the photograph is saturated a brighter rendering is no error, and a too bright rendering elsewhere still feels its
+    gradient.
+    """
     image = dr.select(target >= SATURATED, dr.minimum(image, target), image)
     l1 = dr.mean(dr.mean(dr.abs(image - target)))
     return (1 - dssim) * l1 + dssim * (1 - ssim(image, target, size)) / 2
 
 
 def mask(alpha: "mi.Float", target: "mi.Float") -> "mi.Float":
-    """Mean absolute difference of coverage and mask."""
+    """Return the mean absolute difference of coverage ``alpha`` and mask ``target``."""
     return dr.mean(dr.abs(alpha - target))
 
 
@@ -108,8 +111,8 @@ def _interior(gbuffer):
 
 
 def depth_normal_consistency(gbuffer: GBuffer, camera: Camera) -> "mi.Float":
-    """Depth-normal consistency (2DGS): the mean of 1 − n·n_D over the image, with n the rendered normal and n_D that of the
-    surface which the rendered (expected) depth describes, by central differences."""
+    """Return the depth-normal consistency (2DGS): the mean of 1 − n·n_D over the image, with n the rendered normal and n_D
+    that of the surface which the rendered (expected) depth describes, by central differences."""
     width, height = gbuffer.size
     index = _interior(gbuffer)
     if dr.width(index) == 0:
@@ -125,15 +128,16 @@ def depth_normal_consistency(gbuffer: GBuffer, camera: Camera) -> "mi.Float":
 
 
 def distortion(maps: Maps, extent: float) -> "mi.Float":
-    """2DGS's depth distortion, mean over the image of Σ_ij w_i w_j (t_i − t_j)² = 2 (Σw Σwt² − (Σwt)²), in units of
-    ``extent``², the object's radius: surfels along a ray draw together. ``maps``: all `Maps`."""
+    """Return 2DGS's depth distortion, the mean over the image of Σ_ij w_i w_j (t_i − t_j)² = 2 (Σw Σwt² − (Σwt)²), in units
+    of the squared radius ``extent`` of the object: it draws surfels along a ray together. ``maps`` are those of all
+    pixels."""
     return dr.mean(2 * (maps.alpha * maps.square - dr.square(maps.depth))) / dr.opaque(mi.Float, float(extent) ** 2)
 
 
 def normal_smoothness(gbuffer: GBuffer, reflective: np.ndarray, crease: float = 0.0) -> "mi.Float":
-    """RGS's L_normal: mean squared forward difference of N from pixel to pixel, where both are ``reflective`` (β̂, [H, W]
-    bool, NumPy). With ``crease``, d² counts as d² / (1 + d²/crease²): noise of a few degrees is smoothed, an edge of the
-    object is let be."""
+    """Return RGS's L_normal: the mean squared forward difference of N from pixel to pixel, where both are ``reflective``
+    (β̂, [H, W] bool). With ``crease``, d² counts as d² / (1 + d²/crease²): noise of a few degrees is smoothed, an edge of
+    the object is let be."""
     width, height = gbuffer.size
     index = _interior(gbuffer)
     if dr.width(index) == 0:
@@ -150,15 +154,16 @@ def normal_smoothness(gbuffer: GBuffer, reflective: np.ndarray, crease: float = 
 
 
 def minimum_variation(gbuffer: GBuffer, reflective: np.ndarray, corner: tuple[int, int] = (0, 0)) -> "mi.Float":
-    """How fast the curvature of smooth surfaces changes (minimum-variation surfaces, Moreton and Séquin 1992). Where a flat
-    mirror shows each part of the environment to few photographs, they agree with any wobble of it; held-out views don't.
+    """Return how fast the curvature of smooth surfaces changes (minimum-variation surfaces, Moreton and Séquin 1992). Where
+    a flat mirror shows each part of the environment to few photographs, they agree with any wobble of it; held-out views
+    don't.
 
         mean of F d² / (1 + d²/ε²),   d = ‖N(p + s) − 2 N(p) + N(p − s)‖,   F = lerp(0.04, 1, metallic(p))
 
-    over pixels p and steps s, to the right and down, of `_APART` image widths; N: unit normals. What changes by more than
-    ε = `_BEND`, an edge or the end of one, is let be. F, which has no gradient, is what is reflected at normal incidence
-    (metals as if white): it keeps the balance with the photographs, which say the less about normals the less is reflected.
-    All three pixels are ``reflective`` (β̂, [H, W] bool, NumPy). Of every 2 × 2 pixels only the one at ``corner`` (row,
+    over pixels p and steps s, to the right and down, of `_APART` image widths, with unit normals N. What changes by more
+    than ε = `_BEND`, an edge or the end of one, is let be. F, which has no gradient, is what is reflected at normal
+    incidence (metals as if white): it keeps the balance with the photographs, which say the less about normals the less is
+    reflected. All three pixels are ``reflective`` (β̂, [H, W] bool). Of every 2 × 2 pixels only the one at ``corner`` (row,
     column) is a p.
     """
     width = gbuffer.size[0]
@@ -182,19 +187,20 @@ def minimum_variation(gbuffer: GBuffer, reflective: np.ndarray, corner: tuple[in
 
 
 def delta_normal(gbuffer: GBuffer) -> "mi.Float":
-    """RGS's L_Δn: mean ‖ΔN‖ over the image, of which ``gbuffer`` has all maps."""
+    """Return RGS's L_Δn: the mean of ‖ΔN‖ over the image, of which ``gbuffer`` has all maps."""
     length2 = dr.squared_norm(gbuffer.all.delta_normal)
     nonzero = length2 > 0
     return dr.sum(dr.select(nonzero, dr.sqrt(dr.select(nonzero, length2, 1)), 0)) / (gbuffer.size[0] * gbuffer.size[1])
 
 
 def pearson_depth(depth: "mi.Float", prior: "mi.Float", valid: "mi.Bool", inverse: bool = False) -> "mi.Float":
-    """RGS's L_depth: 1 − r, with r Pearson's correlation of the rendered z-depth and a prior's over the ``valid`` pixels.
+    """Return RGS's L_depth: 1 − r, with r Pearson's correlation of the rendered z-depth and a prior's over the ``valid``
+    pixels.
 
-    ``depth``, ``prior``: one entry per pixel; ``valid``: where both are known (pixels where one is not
-    finite never count). ``inverse``: the prior holds inverse depths, which are compared with 1/z (z > 0 where valid).
-    Differentiable in ``depth``. r knows neither scale nor shift of the prior; where one of the two maps is constant, or
-    fewer than two pixels are valid, it isn't defined, and the loss and its gradient are 0.
+    ``valid`` says where ``depth`` and ``prior`` are both known; pixels where one is not finite never count. Where
+    ``inverse``, the prior holds inverse depths, which are compared with 1/z (z > 0 where valid). The loss is differentiable
+    in ``depth``. r knows neither scale nor shift of the prior; where one of the two
+    maps is constant, or fewer than two pixels are valid, it isn't defined, and the loss and its gradient are 0.
     """
     with dr.suspend_grad():
         valid = valid & dr.isfinite(prior) & dr.isfinite(depth)
@@ -210,10 +216,10 @@ def pearson_depth(depth: "mi.Float", prior: "mi.Float", valid: "mi.Bool", invers
 
 
 def environment_total_variation(log_radiance: "mi.TensorXf") -> "mi.Float":
-    """Total variation of an environment, 1/4π ∫ |∇ log L| dω per radian, summed over channels: each derivative d, along rows
-    and columns, counts as √(d² + `_SLOPE`²) − `_SLOPE`: gentle slopes by their square, edges by their height.
+    """Return the total variation of an environment, 1/4π ∫ |∇ log L| dω per radian, summed over channels: each derivative d,
+    along rows and columns, counts as √(d² + `_SLOPE`²) − `_SLOPE`: gentle slopes by their square, edges by their height.
 
-    ``log_radiance``: ``mi.TensorXf`` [rows, columns, 3], rows from pole to pole as in `Environment`.
+    ``log_radiance`` is [rows, columns, 3], with rows from pole to pole as in `Environment`.
     """
     rows, columns, _ = log_radiance.shape
     polar, azimuthal = np.pi / (rows - 1), 2 * np.pi / columns  # angles from texel to texel

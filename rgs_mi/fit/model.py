@@ -1,4 +1,4 @@
-"""What a fit learns: surfels, environment and shader in unconstrained form, and the optimiser that moves them."""
+"""What a fit learns: surfels, environment and shader in unconstrained form, and the optimizer that moves them."""
 
 import drjit as dr
 import mitsuba as mi
@@ -9,7 +9,7 @@ from ..shading.environment import Environment
 from ..shading.shader import Shader, initial_weights
 from ..surfels.surfels import SH_0, Surfels
 
-#: Unconstrained parameters, a row a surfel.
+#: Unconstrained parameters, one row per surfel.
 SURFEL_PARAMETERS = (
     "centers",
     "rotations",
@@ -24,14 +24,14 @@ SURFEL_PARAMETERS = (
     "curvature",
 )
 ENVIRONMENT, SHADER = "log_environment", "shader"
-#: The step of 3DGS's optimisers is relative to the gradient's own size, however small.
+#: The step of 3DGS's optimizers is relative to the gradient's own size, however small.
 _EPSILON = 1e-15
 _LOG_RADIANCE = (-9.0, 8.0)  # texels that no ray tells apart would else drift to overflow
 _LEAST_SCALE = 1e-6  # world units: smaller surfels overflow on the screen
 
 
 def logit(p: np.ndarray | float, margin: float = 1e-4) -> np.ndarray:
-    """Inverse of the logistic function, for NumPy arrays; ``p`` is kept ``margin`` away from 0 and 1."""
+    """Invert the logistic function, for NumPy arrays of any shape; ``p`` is kept ``margin`` away from 0 and 1."""
     p = np.clip(p, margin, 1 - margin)
     return np.log(p / (1 - p))
 
@@ -43,12 +43,12 @@ def _sigmoid(x):
 class Model:
     """Surfels, environment and shader as Adam sees them.
 
-    ``parameters``: NumPy arrays [N, channels] named as `SURFEL_PARAMETERS`, `ENVIRONMENT` [rows, columns, 3], the
-    logarithm of radiance, and `SHADER` [weights], unless f_φ is the identity. ``rotation``: [3, 3] environment frame to
-    world frame. ``two_sided``: see `Surfels`.
+    ``parameters`` are NumPy arrays [N, channels] named as `SURFEL_PARAMETERS`, `ENVIRONMENT` [rows, columns, 3], the
+    logarithm of radiance, and `SHADER` [weights], unless f_φ is the identity. ``rotation`` [3, 3] takes the environment's
+    frame to the world's. ``two_sided`` is that of `Surfels`.
     """
 
-    def __init__(self, parameters: dict, rotation: np.ndarray, two_sided: bool = True) -> None:
+    def __init__(self, parameters: dict[str, np.ndarray], rotation: np.ndarray, two_sided: bool = True) -> None:
         self.rotation, self.two_sided = np.asarray(rotation, np.float64), bool(two_sided)
         self.optimizer = mi.ad.Adam(lr=1e-3, epsilon=_EPSILON)
         for name, value in parameters.items():
@@ -57,35 +57,46 @@ class Model:
     @classmethod
     def start(
         cls,
-        positions,
-        normals,
-        colors,
-        spacing,
-        environment,
-        rotation,
-        sh_order,
-        seed=0,
-        scale=1.0,
-        opacity=0.7,
-        roughness=0.3,
-        shader="identity",
-        two_sided=None,
-    ):
-        """Surfels at ``positions`` [N, 3], facing ``normals`` [N, 3] (None: random), of ``colors`` [N, 3] (linear), as wide
-        as ``scale`` times their ``spacing`` [N], all of one ``opacity`` and ``roughness``; ``two_sided`` (None: where
-        normals are random, else they point outwards); ``environment`` [rows, columns, 3] radiance to start from;
-        ``shader``: as `Settings` has it."""
+        positions: np.ndarray,
+        normals: np.ndarray | None,
+        colors: np.ndarray,
+        spacing: np.ndarray,
+        environment: np.ndarray,
+        rotation: np.ndarray,
+        sh_order: int,
+        seed: int = 0,
+        scale: float = 1.0,
+        opacity: float = 0.7,
+        roughness: float = 0.3,
+        shader: str = "identity",
+        two_sided: bool | None = None,
+    ) -> "Model":
+        """Make the model that a fit starts with.
+
+        Args:
+          positions:   [N, 3] centers of the surfels, world space
+          normals:     [N, 3] what they face, unit vectors (None: random ones)
+          colors:      [N, 3] their diffuse radiance, linear
+          spacing:     [N] distances to their neighbors; ``scale`` times these are their standard deviations
+          environment: [rows, columns, 3] linear radiance; ``rotation`` [3, 3] takes its frame to the world's
+          sh_order:    order of the spherical harmonics
+          opacity, roughness: of all surfels
+          shader:      'identity' or 'mlp', as in `Settings`
+          two_sided:   see `Surfels` (None: where normals are random; others point outwards)
+        """
         from ..surfels.surfels import rotation_from_normal
 
         n, rng = len(positions), np.random.default_rng(seed)
         two_sided = normals is None if two_sided is None else two_sided
         if normals is None:
-            normals = rng.normal(size=(n, 3))
-            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+            drawn = rng.normal(size=(n, 3))
+            facing = drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
+        else:
+            facing = normals
         return cls(
             {
                 "centers": positions,
-                "rotations": rotation_from_normal(normals, rng.uniform(0, 2 * np.pi, n)),
+                "rotations": rotation_from_normal(facing, rng.uniform(0, 2 * np.pi, n)),
                 "log_scales": np.log(scale * np.repeat(spacing[:, None], 2, 1)),
                 "logit_opacities": np.full((n, 1), logit(opacity)),
                 "sh_dc": (0.5 * colors - 0.5) / SH_0,
@@ -109,7 +120,7 @@ class Model:
         return self.optimizer[name]
 
     def surfels(self, sh_order: int) -> Surfels:
-        """The surfels, with spherical harmonics up to ``sh_order``."""
+        """Return the surfels, with spherical harmonics up to ``sh_order``; differentiable."""
         p = self.optimizer
         sh = p["sh_dc"]
         if sh_order > 0:
@@ -130,21 +141,21 @@ class Model:
         )
 
     def environment(self) -> Environment:
-        """The environment, non-negative by construction."""
+        """Return the environment, non-negative by construction; differentiable."""
         return Environment(dr.exp(dr.clip(self.optimizer[ENVIRONMENT], *_LOG_RADIANCE)), self.rotation)
 
     def shader(self) -> Shader | None:
-        """f_φ; None: the identity."""
+        """Return f_φ; None: the identity."""
         return Shader(self.optimizer[SHADER]) if SHADER in self.optimizer else None
 
     # ---- Surgery ----
 
     def numpy(self, name: str) -> np.ndarray:
-        """One parameter as a NumPy array."""
+        """Return the parameter ``name`` as a NumPy array, detached."""
         return dr.detach(self.optimizer[name]).numpy()
 
     def set(self, name: str, value: np.ndarray, reset: bool = True) -> None:
-        """Replace a parameter; its moments start again from zero, or stay where ``reset`` is off (same shape)."""
+        """Replace the parameter ``name``; its moments start again from zero, or stay where ``reset`` is off (same shape)."""
         moments = self.optimizer.state[name][3]
         del self.optimizer[name]
         self.optimizer[name] = as_tensor(value)
@@ -163,8 +174,8 @@ class Model:
             self._set_moments(name, t, *map(as_float, moments))
 
     def refine_environment(self) -> None:
-        """Twice as many rows and columns of environment, on which the logarithm of radiance and its moments are as before:
-        a texel is a quarter of the old one, and so is its derivative."""
+        """Give the environment twice as many rows and columns, on which the logarithm of radiance and its moments are as
+        before: a texel is a quarter of the old one, and so is its derivative."""
         value = self.optimizer[ENVIRONMENT]
         t, m, v, _ = self.optimizer.state[ENVIRONMENT][3]
         finer = lambda texels: Environment(mi.TensorXf(texels, value.shape), self.rotation).finer().texels
@@ -179,7 +190,7 @@ class Model:
     # ---- State ----
 
     def state(self) -> dict[str, np.ndarray]:
-        """Everything a checkpoint needs, as NumPy arrays."""
+        """Return everything that a checkpoint needs, as NumPy arrays."""
         arrays = {"rotation": self.rotation, "two_sided": np.array(self.two_sided)}
         for name in self.optimizer.keys():
             t, m, v, _ = self.optimizer.state[name][3]
@@ -192,10 +203,10 @@ class Model:
         return arrays
 
     @classmethod
-    def from_state(cls, arrays: dict) -> "Model":
-        """The model that wrote ``state()``."""
+    def from_state(cls, arrays: dict[str, np.ndarray]) -> "Model":
+        """Make the model whose `state` these ``arrays`` are."""
         names = [name for name in (*SURFEL_PARAMETERS, ENVIRONMENT, SHADER) if name in arrays]
-        model = cls({name: arrays[name] for name in names}, arrays["rotation"], arrays["two_sided"])
+        model = cls({name: arrays[name] for name in names}, arrays["rotation"], bool(arrays["two_sided"]))
         for name in names:
             model._set_moments(name, mi.UInt32(int(arrays[f"{name}.t"])), *(as_float(arrays[f"{name}.{k}"]) for k in "mv"))
         return model

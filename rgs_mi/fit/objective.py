@@ -7,17 +7,20 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.bounding_box import BoundingBox
+from ..core.camera import Camera
 from ..datasets.photographs import Photograph
 from ..settings.settings import Settings
 from ..shading import deferred
+from ..splat.gbuffer import GBuffer
 from . import losses
 from .reflection_guided import reflective_mask
 
 
 @dataclass
 class ViewLoss:
-    """The losses of a view: ``terms``, weighted, by the names that curves have for them, ``mi.Float`` of width 1 each; the
-    mean squared ``error`` in display values; ``reflective`` [H, W] bool, β̂ of the view, None where nothing asks for it."""
+    """The losses of a view: weighted ``terms`` by the names that curves have for them, of width 1 each; the mean squared
+    ``error`` in display values, of width 1; and ``reflective`` [H, W] bool, β̂ of the view, None where nothing asks for
+    it."""
 
     terms: "dict[str, mi.Float]"
     error: "mi.Float"
@@ -26,8 +29,8 @@ class ViewLoss:
 
 @dataclass(frozen=True)
 class Objective:
-    """The losses of views under ``settings``; ``extent``: radius of the object in world units; ``box``: where the scene
-    reflects (None: everywhere)."""
+    """The objective under ``settings``, of an object of radius ``extent`` in world units, in a scene that reflects in
+    ``box`` (None: everywhere)."""
 
     settings: Settings
     extent: float
@@ -40,9 +43,9 @@ class Objective:
         return max(w.distortion, w.delta_normal) > 0
 
     def __call__(self, image: deferred.Image, photo: Photograph, masked: bool, consistency: float, step: int) -> ViewLoss:
-        """The losses of ``image``, a view of ``photo``, which has a mask where ``masked``.
+        """Return the losses of ``image``, a rendering of the view of ``photo``, which has a mask where ``masked``.
 
-        ``consistency``: the weight of depth-normal consistency by now; ``step`` decides which quarter of the pixels
+        ``consistency`` is the weight of depth-normal consistency by now; ``step`` decides which quarter of the pixels
         minimum variation looks at.
         """
         w, maps, size = self.settings.weights, image.gbuffer.all, photo.camera.size
@@ -78,15 +81,16 @@ class Objective:
             terms["depth"] = w.depth * losses.pearson_depth(depth, photo.prior, covered, photo.inverse)
         return terms, mask
 
-    def reflective_mask(self, gbuffer, camera) -> np.ndarray:
-        """β̂ of a view, [H, W] bool."""
+    def reflective_mask(self, gbuffer: GBuffer, camera: Camera) -> np.ndarray:
+        """Return β̂ of a view, [H, W] bool: which pixels are reflective."""
         width, height = gbuffer.size
         alpha = dr.select(deferred.within(gbuffer, camera, self.box), gbuffer.all.alpha, 0)
         roughness, alpha = (dr.detach(v).numpy().reshape(height, width) for v in (gbuffer.all.roughness, alpha))
         return reflective_mask(roughness / np.maximum(alpha, 1e-6), alpha, self.settings.reflective)
 
     def environment(self, log_radiance: "mi.TensorXf") -> "mi.Float | None":
-        """Weighted total variation of the environment, ``log_radiance`` [H, 2 H, 3]; None where it has no weight."""
+        """Return the weighted total variation of the environment, whose logarithm of radiance is ``log_radiance``
+        [rows, columns, 3]; of width 1, None where it has no weight."""
         weight = self.settings.weights.environment_tv
         if weight == 0:
             return None

@@ -98,8 +98,8 @@ class FitScene:
         return given.stem if given.suffix == ".xml" else given.name
 
     def settings(self, config: str | Path | None = None, overrides: Sequence[str] = ()) -> Settings:
-        """Return the settings: defaults, over them the YAML beside the scene, ``config`` (a preset or file), and ``overrides``
-        ('a.b=value'). Raises: UserError as `load_config` does."""
+        """Return the settings: defaults, over them the YAML beside the scene, ``config`` (a preset or file), and
+        ``overrides`` ('a.b=value'). Raises: UserError as `load_config` does."""
         beside = self.path.with_suffix(".yaml")
         sources = [beside.absolute()] if beside.is_file() else []
         return load_config(Settings, [*sources, *([config] if config else [])], overrides)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Figure:
-    """``digits`` after the decimal point, ``paper_digits`` so many in the tables of the paper; ``scale``: what a value is
-    multiplied by to be in ``unit``."""
+    """How a number is written: its ``label``, with ``digits`` after the decimal point, of which the tables of the paper have
+    ``paper_digits``; ``scale`` is what a value is multiplied by to be in ``unit``."""
 
     label: str
     digits: int
@@ -35,9 +35,9 @@ FIGURES = {
 }
 
 
-def text(name: str, value, *, unit: bool = False, signed: bool = False, paper: bool = False) -> str:
-    """The ``value`` of the figure ``name``, '' for None; with its ``unit``; with its sign where it is a difference
-    (``signed``); as precisely as the ``paper`` writes it."""
+def text(name: str, value: float | None, *, unit: bool = False, signed: bool = False, paper: bool = False) -> str:
+    """Return the ``value`` of the figure ``name`` in words, '' for None; where asked with its ``unit``, with its sign as a
+    difference has it (``signed``), and as precisely as the ``paper`` writes it."""
     if value is None:
         return ""
     figure = FIGURES[name]
@@ -47,16 +47,16 @@ def text(name: str, value, *, unit: bool = False, signed: bool = False, paper: b
 
 
 def label(name: str) -> str:
-    """What the figure ``name`` is called where its value stands beside it."""
+    """Return what the figure ``name`` is called where its value stands beside it."""
     return FIGURES[name].label
 
 
 def heading(name: str) -> str:
-    """The head of a column of the figure ``name``: its label and its unit, as far as values do not have it."""
+    """Return the head of a column of the figure ``name``: its label, and its unit where values do not have it."""
     figure = FIGURES[name]
     return f"{figure.label}, {figure.unit}" if figure.unit not in ("", "°") else figure.label
 
 
 def number(value: float) -> str:
-    """A number that is none of `FIGURES`: four digits, or whole thousands."""
+    """Return a number that is none of `FIGURES` in words: with four digits, or rounded to an integer from 1000 on."""
     return f"{value:,.0f}".replace(",", " ") if abs(value) >= 1000 else f"{value:.4g}"

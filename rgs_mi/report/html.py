@@ -22,7 +22,8 @@ _QUALITY = 90  # of JPEG
 
 @dataclass(frozen=True)
 class Picture:
-    """An image in a page: its data URI as ``source``, pixels ``width`` by ``height`` as it is shown, ``alt`` in words."""
+    """A picture in a page: ``source`` is its data URI, ``width`` and ``height`` are its pixels on the page, ``alt`` says in
+    words what it shows."""
 
     source: str
     width: int
@@ -30,8 +31,11 @@ class Picture:
     alt: str
 
 
-def render(template: str, **data) -> bytes:
-    """The page of ``templates/TEMPLATE`` with ``data``. Raises: jinja2.UndefinedError where the template wants more."""
+def render(template: str, **data: object) -> bytes:
+    """Fill ``templates/TEMPLATE`` with ``data`` and return the page in UTF-8.
+
+    Raises: jinja2.UndefinedError where the template wants more.
+    """
     return _environment().get_template(template).render(data).encode()
 
 
@@ -53,39 +57,42 @@ def _environment():
 
 
 def href(path: str) -> str:
-    """The address of the file ``path``, relative to the page: never an address of another kind, whatever it is called."""
+    """Return the address of the file ``path`` relative to the page, never one of another kind, whatever the file is
+    called."""
     return "./" + quote(path)
 
 
 # ---- Pictures ----
 
 
-def jpeg(image: np.ndarray, alt: str, stored: int, shown: int | None = None) -> Picture:
-    """``image`` [H, W, 3], display values in [0, 1] or uint8, at most ``stored`` pixels wide, and ``shown`` so wide (None:
-    as it is stored)."""
+def jpeg(image: np.ndarray, alt: str, stored: int, width: int | None = None) -> Picture:
+    """Encode ``image`` [H, W, 3], display values in [0, 1] or uint8, as a JPEG at most ``stored`` pixels wide, which takes
+    ``width`` pixels of the page (None: as many as it has)."""
     pixels, stream = Image.fromarray(to_8bit(image)), io.BytesIO()
     if pixels.width > stored:
         pixels = pixels.resize((stored, max(round(stored * pixels.height / pixels.width), 1)), Image.Resampling.LANCZOS)
     pixels.save(stream, "JPEG", quality=_QUALITY, subsampling=0, optimize=True)
-    width = shown or pixels.width
+    width = width or pixels.width
     return Picture(_data_uri("jpeg", stream), width, round(width * pixels.height / pixels.width), alt)
 
 
 def png(image: np.ndarray, alt: str, zoom: int = 1) -> Picture:
-    """``image`` [H, W, 3], display values in [0, 1] or uint8, without loss, each pixel shown ``zoom`` wide."""
+    """Encode ``image`` [H, W, 3], display values in [0, 1] or uint8, as a PNG; each of its pixels is ``zoom`` wide on
+    the page."""
     stream = io.BytesIO()
     Image.fromarray(to_8bit(image)).save(stream, "PNG", optimize=True)
     return Picture(_data_uri("png", stream), zoom * image.shape[1], zoom * image.shape[0], alt)
 
 
 def hdr(radiance: np.ndarray, alt: str) -> Picture:
-    """Linear ``radiance`` [H, W, 3], packed as `rgbe`, for the control that shows it at an exposure."""
+    """Encode linear ``radiance`` [H, W, 3], packed as `rgbe`, for the control that shows it at an exposure."""
     packed = png(rgbe(radiance), alt)
     return Picture(packed.source, radiance.shape[1], radiance.shape[0], alt)
 
 
 def rgbe(radiance: np.ndarray) -> np.ndarray:
-    """[H, W, 3] linear radiance as [2H, W, 3] uint8: above m, below e in all channels, for m 2^(e − 136) (Ward 1991)."""
+    """Pack linear radiance [H, W, 3] as [2H, W, 3] uint8: above m, below e in all channels, for m 2^(e − 136) (Ward
+    1991)."""
     light = np.maximum(np.nan_to_num(radiance), 0)
     exponent = np.clip(np.frexp(light.max(-1, keepdims=True))[1], -127, 127)
     mantissa = np.clip(np.round(np.ldexp(light, 8 - exponent)), 0, 255)

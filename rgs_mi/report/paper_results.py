@@ -4,6 +4,9 @@ A scene is told by its name, and with it the data set that it belongs to. Figure
 paper calls parameters are surfels.
 """
 
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
 from .figures import heading, text
 from .tables import DETAILS, FIGURES, mean, text_table
 
@@ -67,8 +70,9 @@ PAPER = {
 }
 
 
-def by_data_set(names) -> dict[str, list[str]]:
-    """Data set -> those of ``names`` that are scenes of it; what two have goes where more of the others belong."""
+def by_data_set(names: Iterable[str]) -> dict[str, list[str]]:
+    """Return data set -> those of ``names`` that are scenes of it; a name that two have goes where more of the others
+    belong."""
     plain = {name: name.lower().removesuffix(_SUFFIX) for name in names}
     found, left = {}, set(plain)
     for data_set in sorted(SCENES, key=lambda s: -len(set(plain.values()) & set(SCENES[s]))):
@@ -78,9 +82,9 @@ def by_data_set(names) -> dict[str, list[str]]:
     return found
 
 
-def means(rows, names) -> dict[str, dict]:
-    """For each data set that finished ``rows`` (see `tables`) are of: the means over its scenes, and how many these
-    ``scenes`` are, ``of`` how many. ``names``: all scenes of the suite, which tell its data sets."""
+def means(rows: Sequence[Mapping[str, Any]], names: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Return, for each data set that finished ``rows`` (see `tables`) are of, the means over its scenes, and how many these
+    ``scenes`` are, ``of`` how many. ``names`` are all scenes of the suite, which tell its data sets."""
     table = {}
     for data_set, scenes in by_data_set(names).items():
         mine = {(r["scene"], r["seed"]): r for r in rows if r["scene"] in scenes and r["status"] == "finished"}
@@ -93,22 +97,23 @@ def means(rows, names) -> dict[str, dict]:
     return table
 
 
-def tables(ours: dict[str, dict]) -> list[str]:
-    """What `means` gave, as sections of text: the paper's tables of these data sets, and ``ours`` as a last row of each."""
+def tables(ours: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the paper's tables of the data sets that `means` found, as sections of text, with ``ours`` as a last row of
+    each."""
     sections = []
     for title, (data_sets, figures) in TABLES.items():
-        shown = [k for k, data_set in enumerate(data_sets) if data_set in ours]
-        if not shown:
+        found = [k for k, data_set in enumerate(data_sets) if data_set in ours]
+        if not found:
             continue
         prefix = lambda k: f"{data_sets[k]}: " if len(data_sets) > 1 else ""
-        lines = [("", *(f"{prefix(k)}{heading(name)}" for k in shown for name in figures))]
+        lines = [("", *(f"{prefix(k)}{heading(name)}" for k in found for name in figures))]
         for method, numbers in PAPER[title].items():
-            lines.append((method, *(text(name, n, paper=True) for k in shown for name, n in zip(figures, numbers[k]))))
-        counts = ", ".join(f"{ours[data_sets[k]]['scenes']} of {ours[data_sets[k]]['of']}" for k in shown)
+            lines.append((method, *(text(name, n, paper=True) for k in found for name, n in zip(figures, numbers[k]))))
+        counts = ", ".join(f"{ours[data_sets[k]]['scenes']} of {ours[data_sets[k]]['of']}" for k in found)
         lines.append(
             (
                 f"this run, scenes {counts}",
-                *(text(name, ours[data_sets[k]][name], paper=True) for k in shown for name in figures),
+                *(text(name, ours[data_sets[k]][name], paper=True) for k in found for name in figures),
             )
         )
         section = title if len(data_sets) > 1 or title == data_sets[0] else f"{title}, {data_sets[0]}"

@@ -1,11 +1,14 @@
-"""Pictures of several fits side by side: the truth, then each fit, images and normals."""
+"""Pictures of several fits side by side: ground truth, then each fit, images and normals."""
 
+from collections.abc import Sequence
+from pathlib import Path
 from textwrap import fill
 
 import numpy as np
 from PIL import Image
 
 from ..core.sheet import Sheet
+from ..datasets.types import View
 from ..evaluation.evaluate import ground_truth
 from ..evaluation.metrics import normal_colors
 from ..evaluation.pictures import crop
@@ -15,9 +18,10 @@ _PANEL, _GAP, _MARGIN = 260, 8, 24  # pixels
 _CHARACTERS = 22  # as wide as a panel
 
 
-def write(path, views, columns, background):
-    """Write a picture of a scene: for each of ``views`` a row of images and one of normals. Columns: the truth, then
-    ``columns``, [(label, figures of metrics.json, the run's folder)]; ``background``: as it was fitted with."""
+def write(path: str | Path, views: Sequence[View], columns: Sequence[tuple[str, dict, Path]], background: float) -> None:
+    """Write a picture of a scene: for each of ``views`` a row of images and one of normals. Columns are the ground truth,
+    then ``columns``, [(label, what metrics.json holds, the run's folder)]; ``background`` is the display-space grey level
+    that was fitted with. Raises: UserError where the file can't be written."""
     labels = ["truth", *(f"{fill(label, _CHARACTERS)}\n{_caption(figures)}" for label, figures, _ in columns)]
     rows = [row for view in views for row in _rows(view, [folder / "test" for _, _, folder in columns], background)]
     Sheet(rows, _PANEL, _GAP, _MARGIN, labels).write(path)
@@ -28,8 +32,8 @@ def _caption(figures):
 
 
 def _rows(view, folders, background):
-    """Images and normals of a view: two lists of [H, W, 3] display values, cropped to the object, the truth's first (None:
-    unknown)."""
+    """Images and normals of a view: two lists of [H, W, 3] display values, cropped to the object, the ground truth's first
+    (None: unknown)."""
     normals = [None]
     if view.normal is not None:
         known = np.linalg.norm(view.normal, axis=-1, keepdims=True) > 0.5

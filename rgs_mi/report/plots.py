@@ -3,11 +3,14 @@
 import io
 import re
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .figures import number
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _SIZE = 6.6, 3.5  # inches of 72 pixels
 _INKS = "#1f5fa8", "#c4572b", "#35803f", "#7a4ea3", "#97791a", "#666c73"
@@ -37,11 +40,11 @@ def curves(
     low: float | None = 0.0,
     log: bool = False,
 ) -> str:
-    """A plot of ``series`` {name: (x, y)} as an SVG element, with horizontal ``lines`` {name: y} and vertical ``marks``
-    {name: x}.
+    """Plot ``series`` {name: (x, y)} with horizontal ``lines`` {name: y} and vertical ``marks`` {name: x}, and return an SVG
+    element.
 
-    x from zero; y from ``low`` (None: from the least), or in decades where ``log``. What is not finite, or has no logarithm,
-    is left out.
+    The x axis begins at zero, the y axis at ``low`` (None: at the least), or is logarithmic where ``log``. What is not
+    finite, or has no logarithm, is left out.
     """
     from matplotlib import rc_context
 
@@ -57,8 +60,8 @@ def curves(
     return f'<svg viewBox="{box}" role="img" aria-label="{escape(f"{y_label} over {x_label}")}">{content.strip()}'
 
 
-def draw(series: dict, x_label: str, y_label: str, lines: dict, marks: dict, low: float | None, log: bool):
-    """The `matplotlib.figure.Figure` of `curves`."""
+def draw(series: dict, x_label: str, y_label: str, lines: dict, marks: dict, low: float | None, log: bool) -> "Figure":
+    """Return the `matplotlib.figure.Figure` of `curves`."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
@@ -66,11 +69,11 @@ def draw(series: dict, x_label: str, y_label: str, lines: dict, marks: dict, low
     axes = figure.add_subplot()
     for (name, (x, y)), ink in zip(series.items(), _INKS * (1 + len(series) // len(_INKS))):
         x, y = np.asarray(x, float), np.asarray(y, float)
-        shown = np.isfinite(y) & ((y > 0) | (not log))
-        axes.plot(x[shown], y[shown], "o-" if shown.sum() == 1 else "-", color=ink, label=name)
-    known = np.concatenate([[0.0], *(line.get_xdata() for line in axes.lines)])
+        known = np.isfinite(y) & ((y > 0) | (not log))
+        axes.plot(x[known], y[known], "o-" if known.sum() == 1 else "-", color=ink, label=name)
+    places = np.concatenate([[0.0], *(line.get_xdata() for line in axes.lines)])
     heights = np.concatenate([*(line.get_ydata() for line in axes.lines), [*lines.values()]])
-    axes.set_xlim(0, known.max() or 1)
+    axes.set_xlim(0, places.max() or 1)
     if log and len(heights):
         axes.set_yscale("log")
         _decades(axes, heights)

@@ -5,6 +5,9 @@ import os
 import platform
 import shlex
 import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -14,10 +17,19 @@ from .. import __version__, report
 from ..core.files import write_json
 from ..core.progress import Progress
 from ..core.runtime import peak_rss_mb
+from ..datasets.types import Dataset, View
 from ..evaluation import evaluate, lpips, pictures
 from ..export.mitsuba_scene import export
+from ..fit.curves import Curves
 from ..settings.config import to_dict
+from ..shading.deferred import Lighting
+from ..shading.environment import Environment
+from ..surfels.surfels import Surfels
 from .figures import label, text
+
+if TYPE_CHECKING:
+    from ..fit.scene import FitScene
+    from ..fit.trainer import Fit
 
 METRICS, SHEET, GUIDED = "metrics.json", "contact_sheet.png", "guided.png"
 PREVIEWS = 4  # test views on the sheet and in the report, and with their G-buffers written
@@ -25,13 +37,13 @@ _SUMMARY = ("psnr", "ssim", "lpips", "normal_mae_deg", "surfels", "iterations", 
 _NO_LPIPS = f"not measured, for want of weights: {lpips.INSTALL}"
 
 
-def write(fit, scene, folder, quiet):
-    """Evaluate and export a `Fit` of a `FitScene` into ``folder``, and print what came out and where it is.
+def write(fit: "Fit", scene: "FitScene", folder: Path, quiet: bool) -> None:
+    """Evaluate and export a ``fit`` to ``scene`` into ``folder``, and print what came out and where it is.
 
     Where nothing was held out, pictures show training views and the figures of quality are null.
     Raises: UserError where the disk is full or the folder can't be written.
     """
-    facts = _facts(fit)  # the peak of memory is the fit's, not of judging it
+    facts = _facts(fit)  # the peak of memory is the fit's, not that of its evaluation
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
         exported = export(
@@ -52,11 +64,21 @@ def write(fit, scene, folder, quiet):
     publish(folder, mean | facts | {"views": scores}, fit.curves, rows, environment, exported)
 
 
-def measure(surfels, lighting, dataset, background, spp, folder, quiet) -> tuple[dict, dict, dict]:
-    """Render the views of a `Dataset` that results are of, and write their pictures below ``folder``.
+def measure(
+    surfels: Surfels,
+    lighting: Lighting | None,
+    dataset: Dataset,
+    background: float,
+    spp: int,
+    folder: Path,
+    quiet: bool,
+) -> tuple[dict, dict, dict]:
+    """Render the evaluation views of ``dataset``, and write their pictures below ``folder``.
 
-    Args: see `evaluate.render_view`. Returns: the figures of quality and speed, means as metrics.json has them; its
-    ``views``, {name: scores}; and {name: `pictures.panels`} of those that are shown.
+    Args: see `evaluate.render_view`.
+    Returns: the figures of quality and speed, means as metrics.json has them; its ``views``, {name: scores}; and
+    {name: `pictures.panels`} of the preview views.
+    Raises: UserError where the disk is full or the folder can't be written.
     """
     views, scores, rows = evaluation_views(dataset), {}, {}
     on_sheet = {view.name for view in preview_views(views)}
@@ -82,9 +104,19 @@ def measure(surfels, lighting, dataset, background, spp, folder, quiet) -> tuple
     return mean | {"lpips_reason": reason, "render_fps": fps}, scores, rows
 
 
-def publish(folder, figures, curves, rows, environment, others=()):
+def publish(
+    folder: Path,
+    figures: dict,
+    curves: Curves,
+    rows: Mapping[str, Mapping[str, np.ndarray]],
+    environment: Environment,
+    others: Sequence[Path] = (),
+) -> None:
     """Write metrics.json, contact sheet and report into ``folder``, and print what came out and where it is, the paths
-    ``others`` among it. ``figures``: what metrics.json holds; ``curves``, ``rows``: see `report.write`."""
+    ``others`` among it. ``figures`` are what metrics.json holds; `report.write` explains ``curves`` and ``rows``.
+
+    Raises: UserError where the disk is full or the folder can't be written.
+    """
     write_json(folder / METRICS, figures)
     lines, texels = _summary(figures), environment.texels.numpy()
     pictures.contact_sheet(folder / SHEET, list(rows.values()), texels, folder.resolve().name, lines)
@@ -96,18 +128,18 @@ def publish(folder, figures, curves, rows, environment, others=()):
     )
 
 
-def evaluation_views(dataset) -> list:
-    """The views that results are of: the held-out ones, or a few of those that are fitted."""
+def evaluation_views(dataset: Dataset) -> list[View]:
+    """Return the views that results are of: the held-out ones, or a few of those that are fitted."""
     return dataset.test or dataset.train[:PREVIEWS]
 
 
-def preview_views(views) -> list:
-    """The views of a list that pictures show: `PREVIEWS` of them, evenly spread."""
+def preview_views(views: Sequence[View]) -> list[View]:
+    """Return those of ``views`` that pictures show: `PREVIEWS` of them, evenly spread."""
     return [views[k] for k in sorted({int(k) for k in np.linspace(0, len(views) - 1, PREVIEWS + 2)[1:-1].round()})]
 
 
-def finished(folder) -> bool:
-    """Whether the run in ``folder`` came to its end."""
+def finished(folder: Path) -> bool:
+    """Return whether the run in ``folder`` came to its end."""
     try:
         return bool(json.loads((folder / METRICS).read_text())["finished"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -132,7 +164,7 @@ def _facts(fit) -> dict:
 
 
 def circumstances() -> dict:
-    """With what, where and by which command this process runs, as metrics.json has it."""
+    """Return with what, where and by which command this process runs, as metrics.json has it."""
     return {
         "versions": {
             "rgs_mi": __version__,

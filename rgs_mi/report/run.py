@@ -1,5 +1,6 @@
 """The page of one run."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from skimage.transform import downscale_local_mean
 from ..core.files import atomic_file
 from ..evaluation.evaluate import SCORES
 from ..evaluation.pictures import ERROR_RANGE, NORMAL_RANGE
+from ..fit.curves import Curves
 from ..settings.config import to_dict
 from ..settings.settings import Settings
 from . import html
@@ -27,12 +29,18 @@ _ENVIRONMENT_WORDS = (
 _FILES = ("metrics.json", "curves.csv", "contact_sheet.png", "scene.xml")
 
 
-def write(folder: Path, figures: dict, curves, rows, environment: np.ndarray):
+def write(
+    folder: Path,
+    figures: dict,
+    curves: Curves,
+    rows: Mapping[str, Mapping[str, np.ndarray]],
+    environment: np.ndarray,
+) -> None:
     """Write ``FOLDER/report.html``.
 
     Args:
       figures:     what metrics.json holds
-      curves:      the fit's `Curves`
+      curves:      those of the fit
       rows:        view's name -> its `pictures.panels`
       environment: [rows, columns, 3], linear radiance
 

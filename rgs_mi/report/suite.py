@@ -3,6 +3,7 @@
 import json
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,13 +15,13 @@ from . import html
 from .run import REPORT
 from .tables import FIGURES
 
-_STORED, _SHOWN = 224, 112  # pixels of a thumbnail's width
+_STORED, _WIDTH = 224, 112  # pixels of a thumbnail's width, in the file and on the page
 
 
-def write_suite(path, runs, title: str):
+def write_suite(path: str | Path, runs: Sequence[tuple[str, str | Path | None, str | None]], title: str) -> None:
     """Write the page ``path``: a table of ``runs``, [(scene's name, the run's folder or None, what went wrong or None)].
 
-    A run whose files are missing or damaged is shown with what is wrong with it. Means are over runs that came to an end.
+    A run whose files are missing or damaged is listed with what is wrong with it. Means are over runs that came to an end.
     Raises: UserError where the disk is full or the folder can't be written.
     """
     path = Path(path)
@@ -73,4 +74,4 @@ def _thumbnails(folder, scene):
             continue  # what is missing in a row is seen
         width = max(pixels.shape[1] // 3, 1)
         for k, kind in enumerate(("photograph", "rendering")):
-            yield html.jpeg(pixels[:, k * width : (k + 1) * width, :3], f"{kind} of {scene}", _STORED, _SHOWN)
+            yield html.jpeg(pixels[:, k * width : (k + 1) * width, :3], f"{kind} of {scene}", _STORED, _WIDTH)

@@ -7,6 +7,8 @@ object with a ``label`` and ``against``, the name of the variant that it is comp
 
 import csv
 import io
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -18,12 +20,23 @@ DETAILS = ("iterations", "peak_rss_mb", "normal_ssim", "normal_lpips")
 _IN_PAPER = ("ssim", "normal_mae_deg", "surfels")  # of the paper's ablation, beside its PSNR
 
 
+class Compared(Protocol):
+    """A variant in tables: its ``label``, and the name of the variant ``against`` which it is compared."""
+
+    @property
+    def label(self) -> str: ...
+
+    @property
+    def against(self) -> str: ...
+
+
 # ---- Means ----
 
 
-def means(rows, variants) -> dict[str, dict]:
-    """For each variant its `FIGURES`, the means over seeds, then over scenes; how many ``scenes``; ``difference``: of the
-    `SCORES` to the variant ``against``, over the scenes and seeds that both have, beside it ``difference_by_seed``."""
+def means(rows: Sequence[Mapping[str, Any]], variants: Mapping[str, Compared]) -> dict[str, dict[str, Any]]:
+    """Return for each variant its `FIGURES`, means over seeds, then over scenes; how many ``scenes`` these are; and the
+    ``difference`` of the `SCORES` to the variant ``against``, over the scenes and seeds that both have, beside it
+    ``difference_by_seed``."""
     runs = {(r["variant"], r["scene"], r["seed"]): r for r in rows if r["status"] == "finished"}
     table = {}
     for variant in dict.fromkeys(r["variant"] for r in rows):
@@ -46,8 +59,9 @@ def means(rows, variants) -> dict[str, dict]:
     return table
 
 
-def mean(figures, names) -> dict:
-    """Of {(scene, seed): {name: value}}: the mean over scenes of the mean over their seeds; None of nothing."""
+def mean(figures: Mapping[tuple[str, int], Mapping[str, Any]], names: Iterable[str]) -> dict[str, float | None]:
+    """Return for each of ``names`` the mean over scenes of the mean over their seeds of ``figures``, {(scene, seed):
+    {name: value}}; None where there is no value."""
     result = {}
     for name in names:
         scenes = {}
@@ -61,9 +75,13 @@ def mean(figures, names) -> dict:
 # ---- Tables ----
 
 
-def mean_tables(table, variants, paper) -> str:
-    """What `means` gave as text, a table for each variant that others are compared with; beside it the ``paper``'s
-    {variant: {figure: value}}."""
+def mean_tables(
+    table: Mapping[str, Mapping[str, Any]],
+    variants: Mapping[str, Compared],
+    paper: Mapping[str, Mapping[str, float]],
+) -> str:
+    """Return what `means` gave as text: a table for each variant that others are compared with, and in it the numbers of the
+    ``paper``, {variant: {figure: value}}."""
     texts = []
     for against in dict.fromkeys(variants[name].against for name in table):
         names = [name for name in table if variants[name].against == against]
@@ -98,8 +116,8 @@ def _paper(paper, variant, against):
     ]
 
 
-def scene_table(rows) -> str:
-    """``rows``, [(name, row)], of one scene or one variant as text."""
+def scene_table(rows: Iterable[tuple[str, Mapping[str, Any]]]) -> str:
+    """Return ``rows``, [(name, row)], of one scene or one variant as a table in text."""
     lines = [["", "seed", *map(heading, (*FIGURES, "peak_rss_mb")), ""]]
     for name, r in rows:
         note = "" if r["status"] == "finished" else r["error"] or "not yet"
@@ -108,16 +126,17 @@ def scene_table(rows) -> str:
     return text_table(lines)
 
 
-def text_table(lines) -> str:
-    """Markdown that reads well as plain text too: the first line is the header, the first column words, others numbers."""
+def text_table(lines: Sequence[Sequence[str]]) -> str:
+    """Return a table in Markdown that reads well as plain text, too: the first of ``lines`` is the header, the first column
+    is words, the others are numbers."""
     widths = [max(3, *map(len, column)) for column in zip(*lines)]
     rule = [":" + "-" * (widths[0] - 1), *("-" * (width - 1) + ":" for width in widths[1:])]
     pad = lambda line: [line[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:]))]
     return "\n".join(f"| {' | '.join(line)} |" for line in map(pad, [lines[0], rule, *lines[1:]]))
 
 
-def csv_text(rows, names=None) -> str:
-    """Dictionaries as CSV with the columns ``names`` (None: those of the first).
+def csv_text(rows: Sequence[Mapping[str, object]], names: Sequence[str] | None = None) -> str:
+    """Return ``rows`` as CSV with the columns ``names`` (None: those of the first row).
 
     Words that a spreadsheet would take for a formula have an apostrophe before them, which it takes for a sign of words.
     """

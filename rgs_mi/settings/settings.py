@@ -232,5 +232,5 @@ class Settings:
 
     @property
     def max_surfels(self) -> int:
-        """How many surfels a fit may have: unless it is given, as many as it has time for."""
+        """The most surfels that a fit may have: unless they are given, as many as it has time for."""
         return self.density.max_surfels or max(_SURFELS, int(_SURFELS_A_MINUTE * (self.minutes or 0)))

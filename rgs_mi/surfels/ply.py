@@ -36,7 +36,7 @@ _MATERIAL = {
 _SIGNED = ("delta_normal", "curvature")  # the others of the material are in [0, 1]
 
 
-def write_ply(path, fields: dict[str, np.ndarray]):
+def write_ply(path: str | Path, fields: dict[str, np.ndarray]) -> None:
     """Write surfels as a binary little-endian PLY; the file appears whole or not at all.
 
     Args:
@@ -69,7 +69,7 @@ def write_ply(path, fields: dict[str, np.ndarray]):
     write_vertices(path, vertices)
 
 
-def read_ply(path) -> dict[str, np.ndarray]:
+def read_ply(path: str | Path) -> dict[str, np.ndarray]:
     """Read surfels from a PLY of ours, of 2DGS or of 3DGS (whose third scale is ignored); binary or ASCII, L = 0 to 3.
 
     Returns the fields of `write_ply`, float32. What the file lacks of the material is base_color 0.5, roughness 0.5,

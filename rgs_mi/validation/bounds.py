@@ -31,7 +31,8 @@ _FACTOR, _MORE = 1.15, 0.001  # the margin; to it comes the noise of the truth t
 
 
 def bound(shape: str, environment: str, material: str, roughness: float) -> float | None:
-    """The largest error of split-sum on a sphere, but for the truth's noise; None for other shapes, which reflect themselves.
+    """Return the largest error of split-sum on a sphere, without the ground truth's noise; None for other shapes, which
+    reflect themselves.
 
     Between roughnesses that were measured it is interpolated; in an environment that was not, it is that of the worst.
     """

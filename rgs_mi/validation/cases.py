@@ -11,6 +11,7 @@ differs is the shading alone. A *case* is a shape of one material in an environm
   (`bounds`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -38,7 +39,8 @@ _DEEP = 8
 
 @dataclass(frozen=True)
 class Case:
-    """``shape``: 'sphere' or a model of `targets`; ``environment``: of `targets.environments`."""
+    """A ``shape``, 'sphere' or a model of `targets`, of one principled material in an ``environment`` of
+    `targets.environments`."""
 
     shape: str
     environment: str
@@ -48,22 +50,26 @@ class Case:
 
     @property
     def material(self) -> str:
-        """In words."""
+        """The material in words."""
         return f"{'metal' if self.metallic else 'dielectric'} {'/'.join(f'{c:g}' for c in self.base_color)}"
 
     @property
     def name(self) -> str:
-        """For files."""
+        """The name of the case in names of files."""
         return f"{self.shape}_{self.environment}_{self.material}_{self.roughness:g}".replace(" ", "_").replace("/", "-")
 
     @property
-    def lit(self):
+    def lit(self) -> bool:
         """Whether there is a diffuse lobe."""
         return not self.metallic and any(self.base_color)
 
 
-def grid(shapes=("sphere",), environments=ENVIRONMENTS, roughness=ROUGHNESS) -> list[Case]:
-    """All cases: every shape, environment, material and roughness, the last fastest.
+def grid(
+    shapes: Sequence[str] = ("sphere",),
+    environments: Sequence[str] = ENVIRONMENTS,
+    roughness: Sequence[float] = ROUGHNESS,
+) -> list[Case]:
+    """Return all cases: every shape, environment, material and roughness, the last fastest.
 
     Raises: UserError for a shape or environment that does not exist, and for roughness out of [0, 1].
     """
@@ -87,7 +93,8 @@ def grid(shapes=("sphere",), environments=ENVIRONMENTS, roughness=ROUGHNESS) -> 
 
 @dataclass
 class Result:
-    """What came out for a case, [pixels, 3] each, for the ``pixels`` [pixels] that see the shape."""
+    """What came out for a case: linear radiance [pixels, 3] each, for the indices ``pixels`` [pixels], row by row in an
+    image of ``size`` (width, height), of those that see the shape."""
 
     case: Case
     size: tuple[int, int]
@@ -99,30 +106,30 @@ class Result:
 
     @property
     def difference(self) -> Difference:
-        """Of monte_carlo and path."""
+        """The difference of monte_carlo and path."""
         return Difference(self.monte_carlo, self.path)
 
     @property
     def error(self) -> float:
-        """Of split_sum: Σ|difference| / Σ truth."""
+        """The error of split_sum, Σ|difference| / Σ truth."""
         return relative_error(self.split_sum, self.truth)
 
     @property
     def noise(self) -> float:
-        """The part of `error` that the truth's own noise makes."""
+        """The part of `error` that the noise of `truth` itself makes."""
         a, b = self._weights()
         spread = np.sqrt(a**2 * self.path.variance + b**2 * self.monte_carlo.variance)
         return float(np.sqrt(2 / np.pi) * spread.sum() / self.path.mean.sum())
 
     @property
     def bound(self) -> float | None:
-        """Of `error`: the case's own, and what noise adds."""
+        """The bound of `error`: the case's own, and what noise adds; None where there is none."""
         own = bound(self.case.shape, self.case.environment, self.case.material, self.case.roughness)
         return None if own is None else own + self.noise
 
     @property
-    def truth(self):
-        """The best estimate of the integral: both together, weighted by their variances over all pixels."""
+    def truth(self) -> np.ndarray:
+        """The best estimate of the integral, [pixels, 3]: both together, weighted by their variances over all pixels."""
         a, b = self._weights()
         return a * self.path.mean + b * self.monte_carlo.mean
 
@@ -132,11 +139,11 @@ class Result:
 
     @property
     def interreflection(self) -> float:
-        """What more bounces add, relative to one."""
+        """The radiance that more bounces add, relative to that of one."""
         return float(self.deep.mean.sum() / self.path.mean.sum() - 1)
 
     def failures(self) -> list[str]:
-        """What broke its bound, in words."""
+        """Return what broke its bound, in words."""
         found = []
         if self.difference.passed < SUCCESS:
             found.append(f"monte_carlo differs from path in {1 - self.difference.passed:.1%} of the pixels")
@@ -146,8 +153,8 @@ class Result:
             found.append(f"split_sum is off by {self.error:.2%} (bound: {self.bound:.2%})")
         return found
 
-    def picture(self, values) -> np.ndarray:
-        """[H, W, 3] of values [pixels, 3], zero where the shape is not."""
+    def picture(self, values: np.ndarray) -> np.ndarray:
+        """Return values [pixels, 3] as an image [H, W, 3], zero where the shape is not."""
         width, height = self.size
         image = np.zeros((height * width, 3), np.float32)
         image[self.pixels] = values
@@ -155,16 +162,16 @@ class Result:
 
 
 class Validator:
-    """Compares cases with ``size`` pixels along a side, ``samples`` per pixel and batch of the path tracer's, and twice as
-    many of ours, which cost less. Raises: UserError where these are too few."""
+    """The validator compares cases with ``size`` pixels along a side, ``samples`` per pixel and batch of the path tracer,
+    and twice as many of ours, which cost less. Raises: UserError where these are too few."""
 
-    def __init__(self, size=64, samples=64, seed=0):
+    def __init__(self, size: int = 64, samples: int = 64, seed: int = 0) -> None:
         if size < 2 or samples < 2:
             raise UserError(f"{size} pixels and {samples} samples are too few: needs at least 2 of both")
         self.size, self.samples, self.seed = (size, size), samples, seed
 
     def run(self, case: Case) -> Result:
-        """The estimates of one case."""
+        """Render one case in all ways and return the estimates. A variant must be active."""
         light = {
             "type": "procedural_envmap",
             "name": case.environment,

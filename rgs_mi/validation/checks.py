@@ -2,6 +2,7 @@
 furnace neither estimator makes energy, nor loses more than the BSDF itself."""
 
 import contextlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -16,19 +17,20 @@ from ..shading.tables import interaction, principled
 
 @dataclass
 class Check:
-    """Something that must not exceed its ``bound``."""
+    """A ``value`` that must not exceed its ``bound``."""
 
     name: str
     value: float
     bound: float
 
     @property
-    def passed(self):
+    def passed(self) -> bool:
+        """Whether the value is within its bound."""
         return self.value <= self.bound
 
 
-def checks(roughness=(0.1, 0.3, 0.7), samples=1 << 18) -> list[Check]:
-    """Of sampler, BSDF and tables, for every ``roughness``."""
+def checks(roughness: Sequence[float] = (0.1, 0.3, 0.7), samples: int = 1 << 18) -> list[Check]:
+    """Check sampler, BSDF and tables for every ``roughness``, the white furnace with so many ``samples`` per direction."""
     found = []
     for r in roughness:
         found.append(Check(f"χ² of the sampler, roughness {r:g}: 1 − p", 1 - _chi2(r), 1 - 1e-3))

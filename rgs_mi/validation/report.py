@@ -1,4 +1,4 @@
-"""What `rgs-mi crossvalidate` calls.
+"""The cross-validation as files, which `rgs-mi crossvalidate` writes.
 
 OUT/crossvalidation.html    everything on one page
 OUT/cases.csv               a row a case
@@ -7,6 +7,8 @@ OUT/CASE.exr                float maps: path, monte_carlo, split_sum, z
 
 import itertools
 import sys
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -16,12 +18,19 @@ from ..core.progress import Progress
 from ..report import html
 from ..report.plots import curves
 from ..report.tables import csv_text
+from .cases import Case, Validator
 from .checks import checks
 
 
-def crossvalidate(out, cases, validator, quiet=False, checked=(0.1, 0.3, 0.7)) -> int:
+def crossvalidate(
+    out: Path,
+    cases: Sequence[Case],
+    validator: Validator,
+    quiet: bool = False,
+    checked: Sequence[float] = (0.1, 0.3, 0.7),
+) -> int:
     """Run ``cases`` and the checks for every roughness ``checked``, write what the module says into the folder ``out``,
-    print a summary and return how many bounds were broken."""
+    print a summary and return how many bounds were broken. Raises: UserError where a file can't be written."""
     out.mkdir(parents=True, exist_ok=True)
     found, results = checks(checked), []
     with Progress(None, quiet, "comparing") as progress:

@@ -1,5 +1,6 @@
 """Whether two Monte Carlo estimates are of the same: the Z-test of `mitsuba.testing`, for pixels and for sums over all."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,28 +12,28 @@ GLOBAL = 4.5  # standard errors by which the sums over all pixels may differ
 
 @dataclass
 class Estimate:
-    """``mean`` [pixels, 3] of a number of independent ``batches``, and ``variance`` [pixels, 3], that of the mean."""
+    """The ``mean`` [pixels, 3] of a number of independent ``batches``, and the ``variance`` [pixels, 3] of the mean."""
 
     mean: np.ndarray
     variance: np.ndarray
     batches: int
 
     @classmethod
-    def of(cls, batches) -> "Estimate":
-        """Of independent batches, [batches, pixels, 3]."""
+    def of(cls, batches: np.ndarray | Sequence[np.ndarray]) -> "Estimate":
+        """Make an estimate of independent batches, [batches, pixels, 3]."""
         return cls(np.mean(batches, 0), np.var(batches, 0, ddof=1) / len(batches), len(batches))
 
 
 @dataclass
 class Difference:
-    """Between estimates, ``one`` and the ``other``."""
+    """The difference of two estimates, ``one`` less the ``other``."""
 
     one: Estimate
     other: Estimate
 
     @property
-    def z(self):
-        """In standard errors, [pixels, 3]."""
+    def z(self) -> np.ndarray:
+        """The difference in standard errors, [pixels, 3]."""
         return (self.one.mean - self.other.mean) / np.sqrt(self._variance())
 
     @property
