@@ -24,7 +24,7 @@ T = TypeVar("T")
 
 
 def load_config(cls: type[T], sources: Iterable[str | Path] = (), overrides: Iterable[str] = ()) -> T:
-    """An instance of the model ``cls``: its defaults, then each source, then each override; the later wins.
+    """Make an instance of the model ``cls``: its defaults, then each source, then each override; the later wins.
 
     Args:
       cls:       a frozen pydantic dataclass, all of whose fields have defaults
@@ -52,12 +52,12 @@ def load_config(cls: type[T], sources: Iterable[str | Path] = (), overrides: Ite
 
 
 def to_dict(config: Any) -> dict:
-    """The settings as nested dicts, lists, numbers and strings, for JSON."""
+    """Return the settings ``config`` as nested dictionaries, lists, numbers and strings, for JSON."""
     return TypeAdapter(type(config)).dump_python(config, mode="json")
 
 
 def presets() -> list[str]:
-    """Names of the presets that the package ships."""
+    """Return the names of the presets that the package ships."""
     return sorted(p.name[:-5] for p in _preset_folder().iterdir() if p.name.endswith(".yaml"))
 
 

@@ -30,7 +30,7 @@ class Setting:
 
 
 def fields(cls: Any, prefix: str = "") -> Iterator[Setting]:
-    """The settings of the model ``cls`` itself, keys after ``prefix``."""
+    """Yield the settings of the model ``cls`` itself, their keys after ``prefix``."""
     for name, field in cls.__pydantic_fields__.items():
         low, high = _bounds(field.annotation, field.metadata)
         yield Setting(
@@ -44,7 +44,7 @@ def fields(cls: Any, prefix: str = "") -> Iterator[Setting]:
 
 
 def walk(cls: Any, prefix: str = "") -> Iterator[Setting]:
-    """All settings of the model ``cls`` and of its sections, which are left out themselves."""
+    """Yield all settings of the model ``cls`` and of its sections, which are left out themselves."""
     for setting in fields(cls, prefix):
         if setting.section:
             yield from walk(setting.section, f"{setting.key}.")
@@ -53,18 +53,18 @@ def walk(cls: Any, prefix: str = "") -> Iterator[Setting]:
 
 
 def section(annotation: Any) -> type | None:
-    """The model that ``annotation`` is, or is optionally."""
+    """Return the model that ``annotation`` is, or is optionally; None where it is none."""
     return next((a for a in (annotation, *_alternatives(annotation)) if isinstance(a, type) and is_dataclass(a)), None)
 
 
 def expected(cls: Any, location: Sequence[str | int]) -> str:
-    """What must stand at ``location`` in the model ``cls``, a tuple of keys and indices; '' where there is nothing."""
+    """Return in words what must stand at ``location``, keys and indices, in the model ``cls``; '' where there is nothing."""
     found = _at(cls, location)
     return ", ".join(filter(None, (kind(found[0]), _range(*_bounds(*found))))) if found else ""
 
 
 def section_at(cls: Any, location: Sequence[str | int]) -> type | None:
-    """The model at ``location`` in the model ``cls``; None where something else stands."""
+    """Return the model at ``location`` in the model ``cls``; None where something else stands."""
     found = _at(cls, location)
     return section(found[0]) if found else None
 
@@ -87,7 +87,7 @@ def _at(annotation, location, metadata=()):
 
 
 def kind(annotation: Any) -> str:
-    """A type hint in words."""
+    """Return a type hint in words."""
     annotation, items = _bare(annotation), get_args(_bare(annotation))
     if annotation is types.NoneType:
         return "null"
@@ -104,7 +104,7 @@ def kind(annotation: Any) -> str:
 
 
 def in_yaml(value: Any) -> str:
-    """A value as one writes it in YAML."""
+    """Return a value as one writes it in YAML."""
     if value is None or isinstance(value, bool):
         return "null" if value is None else str(value).lower()
     if isinstance(value, tuple | list):
