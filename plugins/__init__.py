@@ -11,7 +11,7 @@ import mitsuba as mi
 from rgs_mi.core.errors import UserError
 
 if TYPE_CHECKING:
-    from rgs_mi.shading.deferred import Lighting
+    from rgs_mi.shading.lighting import Lighting
     from rgs_mi.surfels.surfels import Surfels
 
     from .rgs_deferred import DeferredIntegrator

@@ -68,17 +68,17 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-from rgs_mi.plugins.surfels import box_of, resolve, surfels_in
 
 from rgs_mi.core.camera import Camera, pixel_directions
 from rgs_mi.core.errors import UserError
 from rgs_mi.shading import deferred, indirect
-from rgs_mi.shading.deferred import Lighting, Shading
 from rgs_mi.shading.environment import Environment, FilteredEnvironment
-from rgs_mi.shading.lighting import lighting_of
+from rgs_mi.shading.lighting import Lighting, Shading, lighting_of
 from rgs_mi.shading.monte_carlo import SAMPLES
 from rgs_mi.shading.shader import Shader
 from rgs_mi.surfels.surfels import Surfels
+
+from .surfels import box_of, resolve, surfels_in
 
 AOVS = {
     "depth": "T",

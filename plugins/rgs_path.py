@@ -39,11 +39,12 @@ Of surfels that lie in exactly one plane a ray meets only the first. Renders pic
 
 import drjit as dr
 import mitsuba as mi
-from rgs_mi.plugins.surfels import box_of, surfels_in
 
 from rgs_mi.core.errors import UserError
 from rgs_mi.shading.monte_carlo import SpecularLobe, WholeLobe
 from rgs_mi.surfels.ray_tracing import SurfelRayTracer
+
+from .surfels import box_of, surfels_in
 
 DIFFUSE = ("radiance", "lit")
 _NO_LIMIT = 0xFFFFFFFF

@@ -9,6 +9,7 @@ from rgs_mi.fit import losses
 from rgs_mi.fit.model import Model
 from rgs_mi.settings.settings import Density, Initialization, Settings, Stage
 from rgs_mi.shading import deferred
+from rgs_mi.shading.lighting import Lighting
 from rgs_mi.shading.split_sum import SplitSum
 from rgs_mi.surfels.surfels import Surfels
 
@@ -38,7 +39,7 @@ def random_photographs() -> Dataset:
     views = []
     for k in range(6):
         camera = orbit_camera(k, size=(83, 75), distance=9.0)
-        image = deferred.render(truth, camera, deferred.Lighting(SplitSum(light.environment().filtered())))
+        image = deferred.render(truth, camera, Lighting(SplitSum(light.environment().filtered())))
         alpha = image.gbuffer.all.alpha.numpy().reshape(75, 83, 1)
         shown = losses.display(image.color, image.gbuffer.all.alpha, 0.0).numpy().T.reshape(75, 83, 3)
         straight = shown / np.maximum(alpha, 1e-3)

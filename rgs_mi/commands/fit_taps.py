@@ -14,6 +14,7 @@ from ..evaluation.metrics import relative_error
 from ..shading.environment import Environment, FilteredEnvironment
 from ..shading.monte_carlo import MonteCarlo
 from ..shading.split_sum import DEFAULT_ETA, SplitSum
+from ..shading.surface import Surface
 from ..shading.taps import COUNT, SHAPE
 
 _ROWS = 256  # of the environments
@@ -25,15 +26,15 @@ _MATERIALS = ((0.0, 0.0), (1.0, 1.0), (0.0, 0.0), (1.0, 0.5), (0.0, 0.0), (1.0, 
 
 @dataclass
 class Samples:
-    """Surfaces, as the arguments of an estimator, in one ``environment``, and the linear radiance that they truly reflect."""
+    """A ``surface`` in one ``environment``, and the linear radiance that it truly reflects."""
 
     environment: FilteredEnvironment
-    surfaces: tuple
+    surface: Surface
     ground_truth: "mi.Color3f"
 
     def estimate(self, entries: "mi.Float | None" = None) -> "mi.Color3f":
         """Return split-sum's linear radiance with a table of taps (None: the shipped one)."""
-        return SplitSum(self.environment, DEFAULT_ETA, entries).specular(*self.surfaces)
+        return SplitSum(self.environment, DEFAULT_ETA, entries).specular(self.surface)
 
 
 def fit_taps(path: str | Path, environments: int, steps: int, seed: int) -> None:
@@ -81,7 +82,7 @@ def sampled(texels: np.ndarray, metallic: float, base_color: float, seed: int) -
     view = np.sqrt(1 - sine**2) * normal + sine * across
     vector = lambda v: mi.Vector3f(as_float(v[:, 0]), as_float(v[:, 1]), as_float(v[:, 2]))
     constant = lambda v: as_float(np.full(_SURFACES, v))
-    surfaces = (
+    surface = Surface(
         vector(normal),
         vector(view),
         as_float(rng.uniform(0, 1, _SURFACES)),
@@ -93,9 +94,9 @@ def sampled(texels: np.ndarray, metallic: float, base_color: float, seed: int) -
         estimator = MonteCarlo(
             environment.unfiltered(), environment.emitter(), DEFAULT_ETA, _SAMPLES, dr.opaque(mi.UInt32, seed)
         )
-        ground_truth = estimator.specular(*surfaces)
+        ground_truth = estimator.specular(surface)
         dr.eval(ground_truth)
-    return Samples(environment.filtered(), surfaces, ground_truth)
+    return Samples(environment.filtered(), surface, ground_truth)
 
 
 def random_environment(rng: np.random.Generator) -> np.ndarray:

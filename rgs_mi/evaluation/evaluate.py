@@ -14,6 +14,7 @@ from ..core.color import display
 from ..datasets.types import View
 from ..fit import losses
 from ..shading import deferred
+from ..shading.lighting import Lighting
 from ..surfels.surfels import Surfels
 from . import lpips, metrics
 
@@ -36,9 +37,7 @@ class Rendering:
     maps: dict[str, np.ndarray]
 
 
-def render_view(
-    surfels: Surfels, lighting: deferred.Lighting | None, camera: Camera, background: float, spp: int = 1
-) -> Rendering:
+def render_view(surfels: Surfels, lighting: Lighting | None, camera: Camera, background: float, spp: int = 1) -> Rendering:
     """Render ``surfels`` under ``lighting`` (None: diffuse only) over the display-space grey level ``background``, with
     ``spp`` samples per pixel, rounded up to a square: linear radiance and all maps are means over a grid, as those of
     'rgs_deferred'."""
@@ -119,7 +118,7 @@ def _finite(value):
 
 
 def frames_per_second(
-    surfels: Surfels, lighting: deferred.Lighting | None, cameras: Sequence[Camera], spp: int = 1, frames: int = 20
+    surfels: Surfels, lighting: Lighting | None, cameras: Sequence[Camera], spp: int = 1, frames: int = 20
 ) -> float:
     """Return the median of frames per second over ``frames`` renderings of ``cameras`` in turn, with ``spp`` samples per
     pixel: G-buffer and shading, kernels compiled and the environment filtered beforehand."""

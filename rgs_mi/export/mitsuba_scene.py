@@ -11,8 +11,8 @@ import numpy as np
 
 from ..core.files import atomic_file, write_exr
 from ..datasets.types import View
-from ..shading.deferred import Shading
 from ..shading.environment import Environment
+from ..shading.lighting import Shading
 from ..shading.shader import Shader
 from ..surfels.ply import write_ply
 from ..surfels.surfels import Surfels

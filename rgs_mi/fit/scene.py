@@ -15,8 +15,8 @@ from ..datasets.types import Dataset
 from ..plugins import deferred_of, surfels_of
 from ..settings.config import load_config
 from ..settings.settings import Settings
-from ..shading.deferred import Shading
 from ..shading.environment import Environment
+from ..shading.lighting import Shading
 
 _ENVIRONMENTS = ("envmap", "procedural_envmap", "constant")
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..settings.settings import Settings, Stage
-from ..shading.deferred import Shading
+from ..shading.lighting import Shading
 from .model import ENVIRONMENT, SHADER
 
 #: The field of `LearningRates` that each parameter of a `Model` obeys.

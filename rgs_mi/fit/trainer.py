@@ -12,8 +12,7 @@ from ..datasets.photographs import Photographs
 from ..datasets.types import Dataset, DepthPrior
 from ..settings.settings import Settings
 from ..shading import deferred
-from ..shading.deferred import Lighting, Shading
-from ..shading.lighting import lighting_of
+from ..shading.lighting import Lighting, Shading, lighting_of
 from ..surfels.proxies import Proxies
 from ..surfels.surfels import CHANNELS, Surfels
 from . import losses, reflection_guided

@@ -22,8 +22,8 @@ from ..evaluation import evaluate, lpips, pictures
 from ..export.mitsuba_scene import export
 from ..fit.curves import Curves
 from ..settings.config import to_dict
-from ..shading.deferred import Lighting
 from ..shading.environment import Environment
+from ..shading.lighting import Lighting
 from ..surfels.surfels import Surfels
 from .figures import label, text
 

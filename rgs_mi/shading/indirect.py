@@ -25,9 +25,10 @@ from ..core.bounding_box import BoundingBox
 from ..surfels.proxies import Proxies
 from ..surfels.surfels import SH_0, Surfels
 from .sequence import points
+from .surface import Surface
 
 if TYPE_CHECKING:
-    from .deferred import Lighting
+    from .lighting import Lighting
 
 KINDS = ("none", "visibility", "one_bounce")
 _RAYS = 32  # from each surfel, of (9)
@@ -118,16 +119,16 @@ class Indirect:
         if hit.two_sided:
             normal = dr.mulsign(normal, -dr.dot(direction, normal))
         lighting = lighting.for_secondary_bounce()
-        surface = (
+        surface = Surface(
             normal,
             -direction,
             hit.column(mi.Float, "roughness"),
             hit.column(mi.Float, "metallic"),
             hit.column(mi.Color3f, "base_color"),
         )
-        specular = lighting.specular(*surface)
+        specular = lighting.specular(surface)
         if not lighting.lit:
             return hit.radiance(direction) + specular
         visibility = self.irradiance_visibility
         visibility = 1 if visibility is None else dr.gather(mi.Color3f, visibility, index)
-        return lighting.diffuse(*surface, irradiance_visibility=visibility) + specular
+        return lighting.diffuse(surface, irradiance_visibility=visibility) + specular

@@ -1,16 +1,121 @@
-"""The lighting of a scene, from how it is shaded: what fits and the integrator `rgs_deferred` both build."""
+"""How surfels are shaded, and the lighting that does it: what fits and the integrator `rgs_deferred` both build."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import drjit as dr
 import mitsuba as mi
 
+from ..core.bounding_box import BoundingBox
+from ..splat.gbuffer import Maps
 from ..surfels.proxies import Proxies
 from ..surfels.surfels import Surfels
-from .deferred import Lighting, Shading
-from .environment import FilteredEnvironment
+from .environment import FilteredEnvironment, IncidentRadiance
 from .indirect import Indirect
-from .monte_carlo import MonteCarlo
+from .monte_carlo import SAMPLES, MonteCarlo
 from .shader import Shader
-from .split_sum import SplitSum
+from .split_sum import DEFAULT_ETA, SplitSum
+from .surface import Surface
+
+# Roughness up to which a surface with a radiance of its own reflects the other surfels wholly, and from which on not at all:
+# what it receives of them is blurred then, and already in that radiance.
+_NARROW, _WIDE = 0.2, 0.4
+
+
+@dataclass(frozen=True)
+class Shading:
+    """How a scene is shaded, as the parameters of its integrator `rgs_deferred` say; ``eta`` is the surfels' index of
+    refraction, and ``box`` says where all this holds (None: everywhere)."""
+
+    specular: Literal["none", "split_sum", "monte_carlo"] = "split_sum"
+    diffuse: Literal["radiance", "lit"] = "radiance"
+    samples: int = SAMPLES
+    eta: float = DEFAULT_ETA
+    box: BoundingBox | None = None
+    indirect: Literal["none", "visibility", "one_bounce"] = "none"
+
+
+@dataclass
+class Lighting:
+    """What surfels reflect, and how.
+
+    estimator  estimates the BSDF's integrals, and holds the environment
+    shader     f_φ (None: the identity)
+    indirect   says how surfels reflect each other (None: they do not)
+    lit        whether their diffuse radiance, too, is that of their base colour under the light, and not their own
+    box        where all this holds (None: everywhere); beyond it they have their own diffuse radiance alone
+    """
+
+    estimator: SplitSum | MonteCarlo
+    shader: Shader | None = None
+    indirect: Indirect | None = None
+    lit: bool = False
+    box: BoundingBox | None = None
+
+    def specular(self, surface: Surface, point: "mi.Point3f | None" = None) -> "mi.Color3f":
+        """Return f_φ(C_s), linear radiance that a `Surface` reflects towards its ``view``; see `SplitSum.specular`. `indirect`
+        needs its world-space ``point`` (None: it reflects the environment alone)."""
+        C_s = self.estimator.specular(surface, self._incident_radiance(surface, point))
+        return C_s if self.shader is None else self.shader(C_s, surface.roughness, surface.cosine)
+
+    def diffuse(
+        self,
+        surface: Surface,
+        point: "mi.Point3f | None" = None,
+        irradiance_visibility: "mi.Color3f | float" = 1,
+    ) -> "mi.Color3f":
+        """Return C_d of a lit `Surface`, as `specular` does C_s; ``irradiance_visibility`` is a of (9) in `indirect.py`."""
+        return self.estimator.diffuse(surface, self._incident_radiance(surface, point), irradiance_visibility)
+
+    def _incident_radiance(self, surface, point) -> IncidentRadiance | None:
+        """The callback for a surface at ``point``; None where there is none."""
+
+        def incident_radiance(light, direction, index):
+            assert self.indirect is not None, "surfaces have a point where they reflect each other"
+            at = lambda v: v if index is None else dr.gather(type(v), v, index)
+            part = 1 if self.lit else dr.clip((_WIDE - at(surface.roughness)) / (_WIDE - _NARROW), 0, 1)
+            return self.indirect.incident_radiance(light, at(point), at(surface.normal), direction, self, part)
+
+        return None if point is None else incident_radiance
+
+    @property
+    def _with_visibility(self) -> Indirect | None:
+        """`indirect` where lit diffuse light has an irradiance visibility."""
+        known = self.lit and self.indirect is not None and self.indirect.irradiance_visibility is not None
+        return self.indirect if known else None
+
+    def with_irradiance_visibility(self, seed: "mi.UInt32 | int" = 0) -> "Lighting":
+        """Return the same lighting with the part of its own light that the object hides from itself; see
+        `Indirect.with_irradiance_visibility`. It must have `indirect`."""
+        assert self.indirect is not None, "nothing hides light where surfels do not reflect each other"
+        return replace(self, indirect=self.indirect.with_irradiance_visibility(self, dr.opaque(mi.UInt32, seed)))
+
+    def as_splatted(self, surfels: Surfels) -> Surfels:
+        """Return the surfels to splat: what is lit has no radiance of its own, but its irradiance visibility in its place."""
+        indirect = self._with_visibility
+        return surfels if indirect is None else indirect.with_visibility_as_radiance(surfels, self.box)
+
+    def irradiance_visibility(self, maps: Maps, mean: "mi.Float") -> "mi.Color3f | float":
+        """Return the irradiance visibility of pixels of these ``maps``, which ``mean`` divides by their coverage."""
+        return 1 if self._with_visibility is None else maps.diffuse * mean
+
+    def for_secondary_bounce(self) -> "Lighting":
+        """Return the lighting of what a reflected ray meets: it reflects the environment alone."""
+        return replace(self, estimator=self.estimator.for_secondary_bounce(), indirect=None)
+
+    def learned(self) -> list:
+        """Return the arrays that a fit changes: texels of the environment as the estimator has them, and the weights of the
+        shader where there is one."""
+        return [self.estimator.environment.texels, *([self.shader.weights] if self.shader else [])]
+
+    def with_learned(self, arrays: list, surfels: Surfels) -> "Lighting":
+        """Return the same lighting with other ``arrays`` in place of `learned`, and for other ``surfels``, moved ones."""
+        return replace(
+            self,
+            estimator=self.estimator.with_texels(arrays[0]),
+            shader=self.shader and Shader(arrays[1]),
+            indirect=self.indirect and replace(self.indirect, surfels=surfels),
+        )
 
 
 def lighting_of(

@@ -22,6 +22,7 @@ import mitsuba as mi
 
 from .environment import FilteredEnvironment, IncidentRadiance
 from .sequence import points
+from .surface import Surface
 
 SAMPLES = 16  # per pixel, unless someone says otherwise
 _WAVEFRONT = 1 << 22  # samples at a time
@@ -48,31 +49,19 @@ class MonteCarlo:
     seed: "mi.UInt32"
     paired: bool = False
 
-    def specular(
-        self,
-        normal: "mi.Vector3f",
-        view: "mi.Vector3f",
-        roughness: "mi.Float",
-        metallic: "mi.Float",
-        base_color: "mi.Color3f",
-        incident_radiance: IncidentRadiance | None = None,
-    ) -> "mi.Color3f":
+    def specular(self, surface: Surface, incident_radiance: IncidentRadiance | None = None) -> "mi.Color3f":
         """Return C_s of (7); see `SplitSum.specular`."""
-        return self._integral(SpecularLobe, normal, view, roughness, metallic, base_color, incident_radiance)
+        return self._integral(SpecularLobe, surface, incident_radiance)
 
     def diffuse(
         self,
-        normal: "mi.Vector3f",
-        view: "mi.Vector3f",
-        roughness: "mi.Float",
-        metallic: "mi.Float",
-        base_color: "mi.Color3f",
+        surface: Surface,
         incident_radiance: IncidentRadiance | None = None,
         irradiance_visibility: "mi.Color3f | float | None" = None,
     ) -> "mi.Color3f":
         """Return C_d of (7), to which ``incident_radiance`` applies, too; ``irradiance_visibility`` is not needed."""
         other = replace(self, seed=self.seed ^ _DIFFUSE)
-        return other._integral(DiffuseLobe, normal, view, roughness, metallic, base_color, incident_radiance)
+        return other._integral(DiffuseLobe, surface, incident_radiance)
 
     def for_secondary_bounce(self) -> "MonteCarlo":
         """Return the estimator of what a reflected ray meets: one sample is enough of what few rays see."""
@@ -82,26 +71,26 @@ class MonteCarlo:
         """Return the same estimator with other ``texels`` of its `FilteredEnvironment`."""
         return replace(self, environment=replace(self.environment, texels=texels))
 
-    def _integral(self, lobe, *surfaces):
+    def _integral(self, lobe, surface, incident_radiance):
         if self.paired:
-            derivatives = replace(self, paired=False)._integral(lobe, *surfaces)
+            derivatives = replace(self, paired=False)._integral(lobe, surface, incident_radiance)
             with dr.suspend_grad():
-                value = replace(self, paired=False, seed=self.seed ^ _OTHER)._integral(lobe, *surfaces)
+                value = replace(self, paired=False, seed=self.seed ^ _OTHER)._integral(lobe, surface, incident_radiance)
             return dr.replace_grad(value, derivatives)
-        n = dr.width(surfaces[0])
+        n = dr.width(surface.normal)
         each = max(1, min(self.samples, _WAVEFRONT // n))
         total = dr.zeros(mi.Color3f, n)
         for first in range(0, self.samples, each):
-            total += self._sum(lobe, first, min(each, self.samples - first), *surfaces)
+            total += self._sum(lobe, first, min(each, self.samples - first), surface, incident_radiance)
         return total / self.samples
 
-    def _sum(self, lobe, first, count, normal, view, roughness, metallic, base_color, incident_radiance):
+    def _sum(self, lobe, first, count, surface, incident_radiance):
         """The sum of the samples ``first`` to ``first + count`` of (7)."""
-        n = dr.width(normal)
+        n = dr.width(surface.normal)
         index = dr.arange(mi.UInt32, n * count)
         pixel, sample = index // count, index % count + dr.opaque(mi.UInt32, first)
-        dr.eval(normal, view, roughness, metallic, base_color)
-        normal, view, roughness, metallic, base_color = _spread((normal, view, roughness, metallic, base_color), count)
+        dr.eval(*surface)
+        normal, view, roughness, metallic, base_color = _spread(surface, count)
         material = lobe(roughness, metallic, base_color, self.eta)
         si = _interaction(normal, view)
         of_light, of_lobe = points(n, self.seed, pixel, sample, sets=2)
@@ -209,13 +198,13 @@ class WholeLobe(_Lobe):
             )
 
 
-def _spread(surfaces, count):
-    """``surfaces`` with each entry ``count`` times in a row. Single numbers, the same for all, stay as they are."""
-    columns = [c for v in surfaces for c in (v if dr.depth_v(v) > 1 else [v])]
+def _spread(surface, count):
+    """A ``surface``'s fields with each entry ``count`` times in a row. Single numbers, the same for all, stay as they are."""
+    columns = [c for v in surface for c in (v if dr.depth_v(v) > 1 else [v])]
     wide = [c for c in columns if dr.width(c) > 1]
     spread = iter(dr.custom(_Spread, wide, count) if wide else [])
     columns = iter([next(spread) if dr.width(c) > 1 else c for c in columns])
-    return [type(v)(*(next(columns) for _ in v)) if dr.depth_v(v) > 1 else next(columns) for v in surfaces]
+    return [type(v)(*(next(columns) for _ in v)) if dr.depth_v(v) > 1 else next(columns) for v in surface]
 
 
 class _Spread(dr.CustomOp):

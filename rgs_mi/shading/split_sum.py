@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from . import tables
 from .environment import FilteredEnvironment, IncidentRadiance
+from .surface import Surface
 from .taps import taps
 
 DEFAULT_ETA = 1.5  # the principled BSDF's default, specular = 0.5
@@ -27,22 +28,14 @@ class SplitSum:
     eta: float = DEFAULT_ETA
     entries: "mi.Float | None" = None
 
-    def specular(
-        self,
-        normal: "mi.Vector3f",
-        view: "mi.Vector3f",
-        roughness: "mi.Float",
-        metallic: "mi.Float",
-        base_color: "mi.Color3f",
-        incident_radiance: IncidentRadiance | None = None,
-    ) -> "mi.Color3f":
-        """Return C_s, the linear radiance that the specular lobes of surfaces reflect towards ``view``; all arguments have
-        one entry per surface, and the result is differentiable in them.
+    def specular(self, surface: Surface, incident_radiance: IncidentRadiance | None = None) -> "mi.Color3f":
+        """Return C_s, the linear radiance that the specular lobes of a `Surface` reflect towards its ``view``, differentiable
+        in all of its fields.
 
-        ``normal`` and ``view`` are unit vectors in world space, ``view`` from the surface to the camera.
         ``incident_radiance``: callback that returns incident radiance after occlusion; None means the unoccluded environment.
         """
-        cosine = dr.dot(normal, view)
+        normal, view, roughness, metallic, base_color = surface
+        cosine = surface.cosine
         reflected = 2 * cosine * normal - view
         E, phi = albedo(cosine, roughness, metallic, base_color, self.eta)
         incoming = mi.Color3f(0)
@@ -54,18 +47,15 @@ class SplitSum:
 
     def diffuse(
         self,
-        normal: "mi.Vector3f",
-        view: "mi.Vector3f",
-        roughness: "mi.Float",
-        metallic: "mi.Float",
-        base_color: "mi.Color3f",
+        surface: Surface,
         incident_radiance: IncidentRadiance | None = None,
         irradiance_visibility: "mi.Color3f | float" = 1,
     ) -> "mi.Color3f":
         """Return C_d of the diffuse lobe, as `specular` does C_s. It receives the part ``irradiance_visibility`` of the light
         ((9) of `indirect.py`); ``incident_radiance`` is not called, since that lobe has no one direction."""
-        E = _table(dr.dot(normal, view), roughness, (3,), self.eta)[0]
-        return self.environment.eval_diffuse(normal) * irradiance_visibility * E * (1 - metallic) * base_color
+        E = _table(surface.cosine, surface.roughness, (3,), self.eta)[0]
+        received = self.environment.eval_diffuse(surface.normal) * irradiance_visibility
+        return received * E * (1 - surface.metallic) * surface.base_color
 
     def for_secondary_bounce(self) -> "SplitSum":
         """Return the estimator of what a reflected ray meets: this one."""

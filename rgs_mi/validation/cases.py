@@ -25,6 +25,7 @@ from ..evaluation.metrics import relative_error
 from ..shading.environment import Environment
 from ..shading.monte_carlo import MonteCarlo
 from ..shading.split_sum import DEFAULT_ETA, SplitSum
+from ..shading.surface import Surface
 from ..targets import environments as _suite
 from .bounds import ROUGHNESS, bound
 from .statistics import GLOBAL, SUCCESS, Difference, Estimate
@@ -182,7 +183,7 @@ class Validator:
         si, pixels, rays = self._hits(scene)
         n = len(pixels)
         view, normal = si.to_world(si.wi), mi.Vector3f(si.sh_frame.n)
-        surfaces = (
+        surface = Surface(
             normal,
             view,
             dr.opaque(mi.Float, case.roughness, n),
@@ -196,7 +197,7 @@ class Validator:
             estimator = MonteCarlo(
                 environment.unfiltered(), scene.environment(), DEFAULT_ETA, 2 * self.samples, dr.opaque(mi.UInt32, seed)
             )
-            return _radiance(estimator, case, surfaces, incident_radiance)
+            return _radiance(estimator, case, surface, incident_radiance)
 
         batches = range(self.seed + 1, self.seed + 1 + BATCHES)
         return Result(
@@ -206,7 +207,7 @@ class Validator:
             Estimate.of([self._path(scene, rays, 2, k) for k in batches]),
             Estimate.of([self._path(scene, rays, _DEEP, BATCHES + k) for k in batches]),
             Estimate.of([sampled(k) for k in batches]),
-            _radiance(SplitSum(environment.filtered(), DEFAULT_ETA), case, surfaces, incident_radiance),
+            _radiance(SplitSum(environment.filtered(), DEFAULT_ETA), case, surface, incident_radiance),
         )
 
     def _hits(self, scene):
@@ -260,10 +261,10 @@ def _shapes(case):
     }
 
 
-def _radiance(estimator, case, surfaces, incident_radiance):
-    """[pixels, 3] what ``estimator`` gives for ``surfaces``."""
+def _radiance(estimator, case, surface, incident_radiance):
+    """[pixels, 3] what ``estimator`` gives for a `Surface`."""
     with dr.suspend_grad():
-        radiance = estimator.specular(*surfaces, incident_radiance)
+        radiance = estimator.specular(surface, incident_radiance)
         if case.lit:
-            radiance += estimator.diffuse(*surfaces, incident_radiance)
+            radiance += estimator.diffuse(surface, incident_radiance)
         return radiance.numpy().T

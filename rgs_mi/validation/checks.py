@@ -12,6 +12,7 @@ import numpy as np
 from ..shading.environment import Environment
 from ..shading.monte_carlo import MonteCarlo, SpecularLobe
 from ..shading.split_sum import DEFAULT_ETA, SplitSum
+from ..shading.surface import Surface
 from ..shading.tables import interaction, principled
 
 
@@ -48,11 +49,11 @@ def checks(roughness: Sequence[float] = (0.1, 0.3, 0.7), samples: int = 1 << 18)
 
 
 def _surface(cosines, roughness, metallic, color):
-    """Arguments of the estimators: surfaces with normal z seen under ``cosines``."""
+    """A `Surface` with normal z seen under ``cosines``."""
     n = len(cosines)
     constant = lambda v: dr.opaque(mi.Float, v, n)
     view = mi.Vector3f(mi.Float(np.sqrt(1 - cosines**2)), 0, mi.Float(cosines))
-    return (
+    return Surface(
         mi.Vector3f(constant(0), constant(0), constant(1)),
         view,
         constant(roughness),
@@ -70,12 +71,12 @@ def _furnace(roughness, metallic, color, samples):
     ours = {}
     with dr.suspend_grad():
         for name, estimator in (("monte_carlo", monte_carlo), ("split_sum", SplitSum(white.filtered(), DEFAULT_ETA))):
-            ours[name] = (estimator.specular(*surface) + estimator.diffuse(*surface)).x.numpy()
+            ours[name] = (estimator.specular(surface) + estimator.diffuse(surface)).x.numpy()
         bsdf = principled(roughness, metallic, color, DEFAULT_ETA)
         index = dr.arange(mi.UInt32, len(cosines) * samples) // samples
         rng = mi.PCG32(size=dr.width(index))
         points = rng.next_float32(), mi.Point2f(rng.next_float32(), rng.next_float32())
-        sample, weight = bsdf.sample(mi.BSDFContext(), interaction(dr.gather(mi.Vector3f, surface[1], index)), *points)
+        sample, weight = bsdf.sample(mi.BSDFContext(), interaction(dr.gather(mi.Vector3f, surface.view, index)), *points)
         own = dr.block_sum(dr.select(sample.pdf > 0, weight.x, 0), samples).numpy() / samples
     return own, ours
 

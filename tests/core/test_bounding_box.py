@@ -13,6 +13,7 @@ from rgs_mi.priors.initialization import surroundings
 from rgs_mi.settings.settings import Density
 from rgs_mi.shading import deferred
 from rgs_mi.shading.environment import Environment
+from rgs_mi.shading.lighting import Lighting
 from rgs_mi.shading.split_sum import SplitSum
 from rgs_mi.surfels.proxies import Proxies
 from rgs_mi.surfels.surfels import CHANNELS
@@ -54,7 +55,7 @@ def test_six_numbers(numbers):
 def test_only_what_is_in_the_box_reflects(lit):
     surfels, camera = sphere_surfels(800, scale=1.0), orbit_camera(0.3)
     environment = Environment(mi.TensorXf(np.random.default_rng(0).random((8, 16, 3), np.float32)), np.eye(3)).filtered()
-    shade = lambda box: deferred.render(surfels, camera, deferred.Lighting(SplitSum(environment), lit=lit, box=box))
+    shade = lambda box: deferred.render(surfels, camera, Lighting(SplitSum(environment), lit=lit, box=box))
     whole, half, none = (np.array(shade(box).color).T for box in (None, BOX, BoundingBox((5.0,) * 3, (6.0,) * 3)))
     own = np.array(deferred.render(surfels, camera, None).color).T
     np.testing.assert_array_equal(none, own)

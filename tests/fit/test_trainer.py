@@ -17,9 +17,9 @@ from rgs_mi.fit.density import Gradients
 from rgs_mi.fit.trainer import Fit
 from rgs_mi.settings.settings import Density, Initialization, LearningRates, Settings, Stage, Weights
 from rgs_mi.shading import deferred
-from rgs_mi.shading.deferred import Shading
 from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.indirect import Indirect
+from rgs_mi.shading.lighting import Lighting, Shading
 from rgs_mi.shading.split_sum import SplitSum
 from rgs_mi.surfels.surfels import Surfels
 
@@ -32,7 +32,7 @@ def test_crops_hold_the_object_and_their_cameras_fit(dataset, downscale):
     photographs = Photographs(dataset.train, downscale, 1.0)
     sizes = set()
     surfels = sphere_surfels(300, seed=2, scale=0.9, opacity_shift=4)
-    lighting = deferred.Lighting(SplitSum(model().environment().filtered()))
+    lighting = Lighting(SplitSum(model().environment().filtered()))
     surfels = Surfels.from_numpy(surfels.numpy(), two_sided=False)
     for i, view in enumerate(dataset.train):
         photo = photographs[i]

@@ -13,8 +13,10 @@ from rgs_mi.core.camera import Camera
 from rgs_mi.shading import deferred
 from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.indirect import Indirect
+from rgs_mi.shading.lighting import Lighting
 from rgs_mi.shading.monte_carlo import MonteCarlo
 from rgs_mi.shading.split_sum import DEFAULT_ETA, SplitSum
+from rgs_mi.shading.surface import Surface
 from rgs_mi.surfels.proxies import Proxies
 from rgs_mi.surfels.surfels import CHANNELS, SH_0, Surfels, rotation_from_normal
 
@@ -74,7 +76,7 @@ def test_what_rays_meet_reflects_by_normals_that_turn():
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     ahead = (point * towards).sum(1) < -0.5
     normal, direction = mi.Vector3f(point[ahead].T), mi.Vector3f(towards[ahead].T)
-    expected = estimator.specular(normal, -direction, mi.Float(0.1), mi.Float(1), mi.Color3f(1)).numpy()
+    expected = estimator.specular(Surface(normal, -direction, mi.Float(0.1), mi.Float(1), mi.Color3f(1))).numpy()
 
     def error(curvature):
         base = tangent_surfels(400, curvature).numpy()
@@ -90,7 +92,7 @@ def test_what_rays_meet_reflects_by_normals_that_turn():
         indirect = Indirect("one_bounce", Proxies(surfels), surfels)
         none = dr.zeros(mi.Color3f, dr.width(direction))
         mine = indirect.incident_radiance(
-            none, mi.Point3f(normal - direction), mi.Vector3f(0), direction, deferred.Lighting(estimator, indirect=indirect)
+            none, mi.Point3f(normal - direction), mi.Vector3f(0), direction, Lighting(estimator, indirect=indirect)
         ).numpy()
         hit = mine.max(0) > 0
         assert hit.mean() > 0.9
@@ -131,7 +133,7 @@ def image(surfels, kind, environment=None):
     """Linear radiance; ``kind``: of `Indirect`, None: without."""
     environment = environment or Environment(mi.TensorXf(np.full((16, 32, 3), LIGHT, np.float32)), np.eye(3))
     indirect = kind and Indirect(kind, Proxies(surfels), surfels)
-    lighting = deferred.Lighting(SplitSum(environment.filtered()), indirect=indirect or None)
+    lighting = Lighting(SplitSum(environment.filtered()), indirect=indirect or None)
     return deferred.render(surfels, CAMERA, lighting).color
 
 
@@ -246,7 +248,7 @@ def lighting(surfels, kind, sampled=False, lit=False):
         if not sampled
         else MonteCarlo(environment.unfiltered(), environment.emitter(), DEFAULT_ETA, 256, mi.UInt32(0))
     )
-    return deferred.Lighting(estimator, indirect=kind and Indirect(kind, Proxies(surfels), surfels), lit=lit)
+    return Lighting(estimator, indirect=kind and Indirect(kind, Proxies(surfels), surfels), lit=lit)
 
 
 def disc_over_a_patch(height=0.5, radius=0.4):

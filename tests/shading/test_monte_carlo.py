@@ -9,6 +9,7 @@ import rgs_mi
 from rgs_mi.shading import split_sum
 from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.monte_carlo import MonteCarlo
+from rgs_mi.shading.surface import Surface
 
 ROUGHNESS = np.float32([0.04, 0.2, 0.4, 0.8])
 BASE = {
@@ -33,17 +34,19 @@ def estimator(pixels, samples, seed=0, **options):
 
 
 def surfaces(values=BASE, differentiate=()):
-    """({name: array}, the arguments of an estimator)."""
+    """({name: array}, the `Surface` that they make)."""
     view = dr.normalize(mi.Vector3f([0.3, 0, 0.2, 0.6], [0, 0.3, 0.5, 0.1], [1, 1, 1, 1]))
     kinds = {"roughness": mi.Float, "metallic": mi.Float, "base_color": mi.Color3f, "normal": mi.Vector3f}
     arrays = {name: kinds[name](values[name]) for name in BASE}
     for name in differentiate:
         dr.enable_grad(arrays[name])
-    return arrays, (dr.normalize(arrays["normal"]), view, *(arrays[n] for n in ("roughness", "metallic", "base_color")))
+    return arrays, Surface(
+        dr.normalize(arrays["normal"]), view, *(arrays[n] for n in ("roughness", "metallic", "base_color"))
+    )
 
 
 def reflected(integrator, lobe, values=BASE):
-    return getattr(integrator, lobe)(*surfaces(values)[1])
+    return getattr(integrator, lobe)(surfaces(values)[1])
 
 
 @pytest.fixture(scope="module", params=["specular", "diffuse"])
@@ -56,7 +59,7 @@ def gradients(request):
         dr.enable_grad(pixels)
         arrays, arguments = surfaces(differentiate=BASE)
         integral = getattr(estimator(Environment(pixels, np.eye(3)), 1 << 12, seed), request.param)
-        dr.backward(dr.sum(dr.sum(integral(*arguments))))
+        dr.backward(dr.sum(dr.sum(integral(arguments))))
         for name, value in (arrays | {"texels": pixels}).items():
             found.setdefault(name, []).append(dr.grad(value).numpy().astype(np.float64))
     return request.param, found
@@ -144,7 +147,7 @@ def test_paired_estimates_free_the_squared_error_of_noise_bias():
         normal, view, _, metallic, color = (dr.detach(v) for v in arguments)
         spread = lambda v: dr.gather(type(v), v, index)
         C = estimator(environment, samples, 1, paired=paired).specular(
-            spread(normal), spread(view), leaf, spread(metallic), spread(color)
+            Surface(spread(normal), spread(view), leaf, spread(metallic), spread(color))
         )
         dr.backward(dr.sum(dr.sum(dr.square(C - spread(target)))))
         return dr.grad(leaf).numpy().reshape(copies, n).astype(np.float64)

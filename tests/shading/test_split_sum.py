@@ -7,6 +7,7 @@ import pytest
 
 from rgs_mi.shading import deferred, prefilter, split_sum, tables
 from rgs_mi.shading.environment import Environment
+from rgs_mi.shading.lighting import Lighting
 from rgs_mi.surfels.surfels import CHANNELS, Surfels
 
 from scenes import layered_surfels, orbit_camera
@@ -133,7 +134,7 @@ def test_gradients_equal_finite_differences(entry):
         for value in [*(getattr(surfels, n) for n in CHANNELS), texels]:
             dr.enable_grad(value)
         estimator = split_sum.SplitSum(Environment(texels, np.eye(3)).filtered())
-        image = deferred.render(surfels, camera, deferred.Lighting(estimator))
+        image = deferred.render(surfels, camera, Lighting(estimator))
         return image, surfels, texels
 
     image, surfels, texels = render(base)
