@@ -197,6 +197,10 @@ class DeferredIntegrator(mi.SamplingIntegrator):
             values += _aov(kind, image, maps, camera, rays)
         return _average(values, width, height, samples)
 
+    def shading(self, eta: float) -> Shading:
+        """Return how this integrator shades surfels of the index of refraction ``eta``."""
+        return Shading(self.specular, self.diffuse, self.samples, eta, self.box, self.indirect)
+
     def lighting(
         self,
         scene: "mi.Scene",
@@ -207,8 +211,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
     ) -> Lighting | None:
         """Return by what `deferred.shade` shades ``surfels`` in the ``scene``, whose `environment` this is; None
         stands for nothing."""
-        shading = Shading(self.specular, self.diffuse, self.samples, eta, self.box, self.indirect)
-        return lighting_of(shading, surfels, environment, scene.environment(), self.shader, seed)
+        return lighting_of(self.shading(eta), surfels, environment, scene.environment(), self.shader, seed)
 
     def environment(self, scene: "mi.Scene") -> FilteredEnvironment | None:
         """Return the scene's environment, filtered as the estimator needs it, which is kept until texels change.

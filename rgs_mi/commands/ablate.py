@@ -19,7 +19,8 @@ from ..fit.scene import FitScene
 from ..report import pictures
 from ..report.tables import mean_tables, means, scene_table
 from ..settings.config import presets, to_dict
-from .jobs import Job, budget, check_names, check_photographs, effort, find_scenes, fit, photographs, rows_of, write_tables
+from .jobs import Job, check_names, check_photographs, effort, find_scenes, fit, photographs, rows_of, write_tables
+from .optimize import budget
 
 
 @dataclass(frozen=True)

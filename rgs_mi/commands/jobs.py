@@ -78,11 +78,6 @@ def check_names(kind: str, names: Sequence[str] | None, there: Collection[str]) 
             raise UserError(f"no {kind} '{name}': choose from {', '.join(there)}")
 
 
-def budget(minutes: float | None) -> list[str]:
-    """Return the overrides that plan a fit to end within ``minutes``; none for None."""
-    return [f"minutes={minutes}", "iterations=null"] if minutes is not None else []
-
-
 def effort(settings: dict) -> str:
     """Return the budget of a fit with these ``settings``, in words."""
     return f"{settings['iterations']} steps a fit" if settings["iterations"] else f"{settings['minutes']:g} minutes a fit"

@@ -58,11 +58,7 @@ def optimize(
     Raises: UserError for bad input, a package that is missing, a folder that can't be written, and a fit that diverges.
     """
     scene = FitScene.load(path, data, variables)
-    overrides = [
-        *overrides,
-        *([f"minutes={minutes}", "iterations=null"] if minutes is not None else []),
-        *([f"seed={seed}"] if seed is not None else []),
-    ]
+    overrides = [*overrides, *budget(minutes), *([f"seed={seed}"] if seed is not None else [])]
     settings = scene.settings(config, overrides)
     folder = Path(out) if out else Path("runs") / scene.name
     saved = _saved(folder, resume)
@@ -79,6 +75,11 @@ def optimize(
     if stopped:
         print(f"stopped at {100 * fit.progress:.0f}%; go on with the same command and --resume")
     return folder
+
+
+def budget(minutes: float | None) -> list[str]:
+    """Return the overrides that plan a fit to end within ``minutes``; none for None."""
+    return [f"minutes={minutes}", "iterations=null"] if minutes is not None else []
 
 
 # ---- Start ----

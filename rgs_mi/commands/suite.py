@@ -17,7 +17,8 @@ from ..fit.scene import FitScene
 from ..report import paper_results, write_suite
 from ..report.tables import DETAILS, FIGURES, mean, scene_table
 from ..settings.config import to_dict
-from .jobs import Job, budget, check_names, check_photographs, effort, find_scenes, fit, photographs, rows_of, write_tables
+from .jobs import Job, check_names, check_photographs, effort, find_scenes, fit, photographs, rows_of, write_tables
+from .optimize import budget
 
 NAME = "suite"
 _REMARK = (

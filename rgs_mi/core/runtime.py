@@ -95,6 +95,11 @@ def set_variant(name: str = "llvm_ad_rgb") -> None:
         )
 
 
+def cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def cache_folder(kind: str = "") -> Path:
     """The folder ``kind`` of what takes long to compute and is kept, path-traced photographs, depth priors and undistorted
     photographs: below the one that the environment variable `CACHE_VARIABLE` names, or ``data`` in the current folder."""

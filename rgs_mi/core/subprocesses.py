@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .errors import UserError, run_main
-from .runtime import set_variant
+from .runtime import cores, set_variant
 
 
 def apart(function: Callable, *arguments: object) -> Any:
@@ -40,7 +40,7 @@ def each_apart(
     """
     waiting, running = list(calls), {}
     # set_variant() says why never one
-    threads = max(2, _cores() // workers) if min(workers, len(waiting)) > 1 else None
+    threads = max(2, cores() // workers) if min(workers, len(waiting)) > 1 else None
     try:
         while waiting or running:
             while waiting and len(running) < workers:
@@ -58,11 +58,6 @@ def each_apart(
     finally:
         for call in running.values():
             call.process.kill()
-
-
-def _cores() -> int:
-    """The number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 class _Call:

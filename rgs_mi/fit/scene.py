@@ -71,7 +71,7 @@ class FitScene:
             variables,
             Path(surfels.photographs),
             Environment.from_emitter(scene.environment()),
-            Shading(integrator.specular, integrator.diffuse, integrator.samples, surfels.eta),
+            integrator.shading(surfels.eta),
         )
 
     @staticmethod
@@ -102,7 +102,10 @@ class FitScene:
         ``overrides`` ('a.b=value'). Raises: UserError as `load_config` does."""
         beside = self.path.with_suffix(".yaml")
         sources = [beside.absolute()] if beside.is_file() else []
-        return load_config(Settings, [*sources, *([config] if config else [])], overrides)
+        settings = load_config(Settings, [*sources, *([config] if config else [])], overrides)
+        if settings.minutes is None and settings.iterations is None:
+            raise UserError("settings: minutes and iterations are both null: give one of them, which bounds the fit")
+        return settings
 
     def dataset(self, quiet: bool = False) -> Dataset:
         """Return the photographs; those of a scene are path-traced on first use, which takes minutes.

@@ -50,7 +50,8 @@ class Schedule:
         s = self.settings
         if s.iterations is not None:
             return min(1.0, steps / s.iterations)
-        return min(1.0, seconds / (60 * (s.minutes or 0)))
+        assert s.minutes is not None, "FitScene.settings refuses settings that have neither"
+        return min(1.0, seconds / (60 * s.minutes))
 
     def stage(self, progress: float) -> Stage:
         """The level of the pyramid in use."""

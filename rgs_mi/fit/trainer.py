@@ -107,9 +107,17 @@ class Fit:
         environment = learned.unfiltered() if sampled else learned.filtered()
         if not training:
             return lighting_of(shading, surfels, environment, learned.emitter() if sampled else None, shader)
-        shading = replace(shading, samples=self.settings.monte_carlo_samples)
-        kept = self.emitter, shader, self.step_number, self.proxies, self.irradiance_visibility
-        return lighting_of(shading, surfels, environment, *kept, paired=True)
+        return lighting_of(
+            replace(shading, samples=self.settings.monte_carlo_samples),
+            surfels,
+            environment,
+            self.emitter,
+            shader,
+            seed=self.step_number,
+            proxies=self.proxies,
+            irradiance_visibility=self.irradiance_visibility,
+            paired=True,
+        )
 
     def _refresh(self, surfels):
         """Rebuild what serves many steps."""
@@ -154,8 +162,9 @@ class Fit:
 
     def _follow_schedule(self):
         """Bring rates, and rows of the environment, to where they should be by now."""
-        height, optimizer = self.model[ENVIRONMENT].shape[0], self.model.optimizer
-        for _ in range((self.schedule.envmap_height(self.progress, height, self.pixels) // height).bit_length() - 1):
+        optimizer = self.model.optimizer
+        height = self.schedule.envmap_height(self.progress, self.model[ENVIRONMENT].shape[0], self.pixels)
+        while self.model[ENVIRONMENT].shape[0] < height:
             self.model.refine_environment()
         rates = self.schedule.learning_rates(optimizer.keys(), self.progress, self.extent, self.model.two_sided)
         optimizer.set_learning_rate(rates)

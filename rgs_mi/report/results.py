@@ -1,7 +1,6 @@
 """What a run leaves behind: metrics.json, the scene, pictures of the test views, a contact sheet, a report, a summary."""
 
 import json
-import os
 import platform
 import shlex
 import sys
@@ -14,9 +13,9 @@ import mitsuba as mi
 import numpy as np
 
 from .. import __version__, report
-from ..core.files import write_json
+from ..core.files import write_json, write_png
 from ..core.progress import Progress
-from ..core.runtime import peak_rss_mb
+from ..core.runtime import cores, peak_rss_mb
 from ..datasets.types import Dataset, View
 from ..evaluation import evaluate, lpips, pictures
 from ..export.mitsuba_scene import export
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
 METRICS, SHEET, GUIDED = "metrics.json", "contact_sheet.png", "guided.png"
 PREVIEWS = 4  # test views on the sheet and in the report, and with their G-buffers written
 _SUMMARY = ("psnr", "ssim", "lpips", "normal_mae_deg", "surfels", "iterations", "train_seconds", "render_fps")
+_TOO_SMALL = "not measured: no test views that are large enough"  # for LPIPS
 _NO_LPIPS = f"not measured, for want of weights: {lpips.INSTALL}"
 
 
@@ -59,7 +59,7 @@ def write(fit: "Fit", scene: "FitScene", folder: Path, quiet: bool) -> None:
         lighting = fit.lighting(surfels)
     mean, scores, rows = measure(surfels, lighting, fit.dataset, fit.settings.background, fit.settings.spp, folder, quiet)
     if (guided := fit.guided_picture()) is not None:
-        pictures.write_png(folder / GUIDED, guided / 255)
+        write_png(folder / GUIDED, guided / 255)
     fit.curves.write(folder)
     publish(folder, mean | facts | {"views": scores}, fit.curves, rows, environment, exported)
 
@@ -93,13 +93,9 @@ def measure(
     if not dataset.test:
         scores = {}
     mean = evaluate.mean_scores(list(scores.values()))
-    reason = (
-        None
-        if mean["lpips"] is not None
-        else "not measured: no test views that are large enough"
-        if lpips.installed()
-        else _NO_LPIPS
-    )
+    reason = None
+    if mean["lpips"] is None:
+        reason = _TOO_SMALL if lpips.installed() else _NO_LPIPS
     fps = evaluate.frames_per_second(surfels, lighting, [view.camera for view in views], spp)
     return mean | {"lpips_reason": reason, "render_fps": fps}, scores, rows
 
@@ -173,7 +169,7 @@ def circumstances() -> dict:
             "python": platform.python_version(),
         },
         "machine": {
-            "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+            "cpus": cores(),
             "threads": dr.thread_count(),
             "processor": platform.machine(),
             "system": platform.system(),

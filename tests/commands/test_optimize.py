@@ -281,6 +281,7 @@ def test_mistakes(inputs, tmp_path):
         "no scene at": [tmp_path / "none.xml"],
         "malformed YAML": [scene, "--data", data, "--config", write("bad.yaml", "density: [1, ")],
         "did you mean": [scene, "--data", data, "--set", "densty.start=0.1"],
+        "both null": [scene, "--data", data, "--set", "minutes=null"],
         "'flat' is a OrthographicCamera": [write("flat.xml", sensor), "--data", data],
         "integrator is a": [
             write(

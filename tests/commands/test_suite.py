@@ -190,7 +190,7 @@ def work(name, seconds):
 
 
 def test_workers(monkeypatch):
-    monkeypatch.setattr(subprocesses, "_cores", lambda: 8)
+    monkeypatch.setattr(subprocesses, "cores", lambda: 8)
     calls = [("a", 4), ("bad", 0.1), ("c", 0.1)]
     ended = list(subprocesses.each_apart(work, calls, 2))
     assert sorted(arguments for arguments, _, _ in ended) == sorted(calls)
