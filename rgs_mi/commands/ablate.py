@@ -37,9 +37,9 @@ class Variant:
 
 
 #: What surfels at random lack: the shape that masks agree on, and rates for normals that are nearly right.
-HULL = ("initialization.hull=true", "initialization.carve=false", "learning_rates.rotations=[2e-3,2e-4]")
+HULL = ("initialization.hull=true", "initialization.compare=false", "learning_rates.rotations=[2e-3,2e-4]")
 #: The shape that photographs agree on, too.
-STEREO = (*HULL, "initialization.carve=true")
+STEREO = (*HULL, "initialization.compare=true")
 #: Cross-view shape consistency regularisation; in the paper's loss it stands in the place of 2DGS's own consistency.
 CSCR = (
     *STEREO,

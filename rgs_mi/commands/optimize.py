@@ -102,7 +102,7 @@ def _saved(folder, resume):
 def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = True) -> Fit:
     """Return the fit of a ``scene`` to the photographs of ``dataset``, at its beginning."""
     begin = settings.initialization
-    points = initial_points(dataset, begin.surfels, settings.seed, begin.hull, begin.carve, quiet)
+    points = initial_points(dataset, begin.surfels, settings.seed, begin.hull, begin.compare, quiet)
     random = points[1] is None and not (dataset.points is not None and len(dataset.points))
     opacity = begin.opacity or (_ANYWHERE if random else _ON_SURFACE)
     shading = _shading(scene, dataset, settings)
@@ -133,8 +133,9 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
 
 def _with_surroundings(points, dataset, settings):
     """`initial_points` of the object and whatever else photographs show, and those of what lies farther away."""
-    positions, _, colors, spacing = points
-    normals = np.random.default_rng((settings.seed, 2)).normal(size=positions.shape)
+    positions, normals, colors, spacing = points
+    if normals is None:
+        normals = np.random.default_rng((settings.seed, 2)).normal(size=positions.shape)
     near = positions, normals / np.linalg.norm(normals, axis=1, keepdims=True), colors, spacing
     far: tuple = surroundings(dataset, settings.initialization.surroundings, settings.seed)
     return tuple(np.concatenate(pair) for pair in zip(near, far))

@@ -1,7 +1,7 @@
 """Depth priors: what is known of a photograph's depth before anything is fitted, one interface for all of them.
 
 hull    the visual hull of the masks (`hull.py`): no network, and no reflection misleads it
-stereo  that hull, less what the photographs look through (`stereo.py`)
+stereo  depths that the photographs agree on (`stereo.py`), unknown elsewhere
 files   maps of any estimator, one a photograph (`files.py`)
 vggt    the foundation model (`vggt.py`), where its package and weights are
 none
@@ -17,12 +17,13 @@ import numpy as np
 
 from ..core.caches import cached_arrays
 from ..core.errors import UserError
+from ..datasets.images import resize
 from ..datasets.types import DepthPrior, View
 from . import files, hull, stereo, vggt
 
 __all__ = ["NAMES", "DepthPrior", "depth_priors"]
 
-_VERSION = 2  # of everything that decides what is in the maps: a cached prior of another version is not read
+_VERSION = 3  # of everything that decides what is in the maps: a cached prior of another version is not read
 
 
 def _hull(views: Sequence[View], resolution: int | None = None) -> list[DepthPrior]:
@@ -31,9 +32,15 @@ def _hull(views: Sequence[View], resolution: int | None = None) -> list[DepthPri
     return _depths(hull.visual_hull(views, resolution), views)
 
 
-def _stereo(views: Sequence[View], resolution: int | None = None) -> list[DepthPrior]:
-    """As `_hull`, of `stereo.carved_hull`."""
-    return _depths(stereo.carved_hull(views, resolution), views)
+def _stereo(views: Sequence[View]) -> list[DepthPrior]:
+    """z-depths that the photographs agree on, NaN elsewhere. Needs a JIT variant."""
+    mesh = hull.surface(hull.visual_hull(views))[:2] if any(view.masked for view in views) else None
+    known = lambda m: np.where(m.likeness > 0, m.depth, np.nan)
+    maps = stereo.verified(stereo.depth_maps(views, mesh))
+    return [
+        DepthPrior(resize(known(m), *v.pixels.shape[:2]), confidence=resize(m.likeness, *v.pixels.shape[:2]))
+        for m, v in zip(maps, views)
+    ]
 
 
 def _depths(field, views):
@@ -59,7 +66,7 @@ def depth_priors(
       name: one of `NAMES`
       cache: folder where results are kept, or None. A result is found again by the photographs' pixels, the options, the
         hull's cameras and VGGT's weights, wherever the files lie. What `files` reads is not kept a second time
-      options: hull, stereo: resolution; files: folder, inverse, suffix (`files.load`); vggt: weights, batch, overlap,
+      options: hull: resolution; files: folder, inverse, suffix (`files.load`); vggt: weights, batch, overlap,
         background (`vggt.estimate`); none takes any
 
     Raises: UserError for a name or an option that is not there, and as the prior itself does.

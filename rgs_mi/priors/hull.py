@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, spatial, special
+from scipy import ndimage, special
 
 from ..core.camera import Camera, focus_point, opaque, pixel_rays
 from ..core.errors import UserError
@@ -22,7 +22,6 @@ _PIXEL_VARIANCE = 1 / 12  # of the box that an antialiased mask has been average
 _FULL = 0.9  # a mask with more than this in a border pixel goes on beyond the frame
 _PAD = 2  # pixels of nothing around a mask that ends in its frame, as wide as the blur reaches
 _STEPS = 160, 400  # along the longest side, at least and at most, where a step would be a pixel
-_BEND, _DENSER = 0.3, 4  # difference of unit normals from sample to sample that is too much; how much denser samples may be
 
 
 @dataclass(frozen=True)
@@ -265,52 +264,6 @@ def surface(field: SignedField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     vertices = (field.lower + field.step * nodes).astype(np.float32)
     return vertices, faces.astype(np.int32), normals.astype(np.float32)
-
-
-def sample_surface(
-    vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, count: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return ``count`` points on a mesh as of `surface`: positions [count, 3] and unit normals [count, 3], float32. They are
-    spread evenly, but up to four times as densely where the mesh bends.
-
-    Six times as many weighted samples are thinned to a Poisson-disk set, in rounds: a sample stays when no
-    remaining neighbour comes before it in a random order. Too many are cut and too few topped up at random.
-    """
-    corners = vertices[faces].astype(np.float64)
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    bend = np.sqrt(area.sum() / count) * _bend(faces, normals, area)
-    density = np.clip((bend / _BEND) ** 2, 1, _DENSER)
-    face = rng.choice(len(faces), 6 * count, p=area * density / (area * density).sum())
-    u, v = np.sqrt(rng.random(6 * count)), rng.random(6 * count)
-    weights = np.stack([1 - u, u * (1 - v), u * v], -1)[:, :, None]
-    positions = (weights * corners[face]).sum(1)
-
-    radius = 0.69 * np.sqrt((area * density).sum() / (count * density[face]))
-    a, b = spatial.KDTree(positions).query_pairs(radius.max(), output_type="ndarray").T  # a < b: the index is the order
-    close = np.linalg.norm(positions[a] - positions[b], axis=1) < np.minimum(radius[a], radius[b])
-    a, b = a[close], b[close]
-    state = np.zeros(6 * count, np.int8)  # 0 open, 1 kept, -1 removed
-    while (state == 0).any():
-        held = np.zeros(6 * count, bool)
-        held[b] = True
-        state[(state == 0) & ~held] = 1
-        state[b[state[a] == 1]] = -1
-        open_ = (state[a] == 0) & (state[b] == 0)
-        a, b = a[open_], b[open_]
-    kept, rest = np.flatnonzero(state == 1), np.flatnonzero(state != 1)
-    chosen = np.concatenate([rng.permutation(kept), rng.permutation(rest)])[:count]
-
-    normal = (weights[chosen] * normals[faces[face[chosen]]]).sum(1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    return positions[chosen].astype(np.float32), normal.astype(np.float32)
-
-
-def _bend(faces, normals, area):
-    """[F] how much the normals of a mesh change over a unit of length, averaged over neighbouring faces."""
-    corners = normals[faces].astype(np.float64)
-    change = np.linalg.norm(corners - corners.mean(1, keepdims=True), axis=2).max(1)
-    total = np.bincount(faces.ravel(), np.repeat(change * np.sqrt(area / 2), 3))  # of change over √(2 area), times the area
-    return (total / np.maximum(np.bincount(faces.ravel(), np.repeat(area, 3)), 1e-12))[faces].mean(1)
 
 
 def depth_maps(vertices: np.ndarray, faces: np.ndarray, cameras: Sequence[Camera]) -> list[np.ndarray]:

@@ -1,4 +1,5 @@
-"""Where the first surfels stand: on the visual hull, on a sparse point cloud, or anywhere in view."""
+"""Where the first surfels stand: on the visual hull, where photographs agree on a depth, on a sparse point cloud, or anywhere in
+view."""
 
 import numpy as np
 from scipy import spatial
@@ -7,8 +8,12 @@ from ..core.camera import focus_point
 from ..core.color import srgb_decode
 from ..datasets.types import Dataset
 from . import hull, stereo
+from .sampling import sample_surface
+from .surface_points import oriented_points, seen_through
 
 _FAR = 10
+_DEEPER = 2  # area of what lies below the hull, over that of the hull that is seen through
+_FEW = 0.1  # of the points that are wanted: fewer that photographs agree on are no start
 _SRGB_TO_LINEAR = srgb_decode(np.arange(256) / 255).astype(np.float32)
 
 
@@ -17,24 +22,26 @@ Points = tuple[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray]
 
 
 def initial_points(
-    dataset: Dataset, count: int, seed: int = 0, on_hull: bool = True, carve: bool = True, quiet: bool = True
+    dataset: Dataset, count: int, seed: int = 0, on_hull: bool = True, compare: bool = True, quiet: bool = True
 ) -> Points:
     """Return the starting points of a fit to ``dataset.train``, world space, all float32 (docs/method.md §5).
 
-    The surface of the visual hull (of `stereo.carved_hull` with ``carve``) where photographs have masks and ``on_hull`` is
-    set (``count`` points), else ``dataset.points`` (a random ``count`` of them where there are more), else ``count`` points
-    at random in the ball that the cameras look into. ``quiet``: no progress.
+    Where photographs have masks and ``on_hull`` is set, ``count`` points on the visual hull; with ``compare`` less those that
+    photographs look through, plus what they agree on below it. Where they have none, about ``count`` points that photographs
+    agree on, with ``compare``; else, or where these are few, ``dataset.points`` (a random ``count`` of them where there are
+    more), else ``count`` points at random in the ball that the cameras look into. ``quiet``: no progress.
 
-    Returns: positions [N, 3]; unit normals [N, 3], or None without a hull; linear colours [N, 3], the mean of the
+    Returns: positions [N, 3]; unit normals [N, 3], or None for points without a surface; linear colours [N, 3], the mean of the
     photographs that see the point; spacing [N], the mean distance to the three nearest neighbours (at least 1e-7).
     """
     rng, views = np.random.default_rng(seed), dataset.train
-    if on_hull and any(view.masked for view in views):
-        mesh = hull.surface(stereo.carved_hull(views, quiet=quiet) if carve else hull.visual_hull(views))
-        positions, normals = hull.sample_surface(*mesh, count, rng)
-        spacing = _spacing(positions)
-        depths = hull.depth_maps(*mesh[:2], [view.camera for view in views])
-        return positions, normals, _colors(positions, views, depths, 2 * float(np.median(spacing))), spacing
+    if any(view.masked for view in views):
+        if on_hull:
+            return _on_hull(views, count, rng, compare, quiet)
+    elif compare:
+        positions, normals = oriented_points(stereo.verified(stereo.depth_maps(views, quiet=quiet)), count, rng)
+        if len(positions) > _FEW * count:
+            return positions, normals, _colors(positions, views), _spacing(positions)
     if dataset.points is not None and len(dataset.points):
         chosen = np.sort(rng.permutation(len(dataset.points))[:count])
         positions = np.asarray(dataset.points, np.float32)[chosen]
@@ -48,6 +55,21 @@ def initial_points(
         ball *= rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1, keepdims=True)
         positions = (center + reach * min(half, 1.0) * ball).astype(np.float32)
     return positions, None, _colors(positions, views), _spacing(positions)
+
+
+def _on_hull(views, count, rng, compare, quiet) -> Points:
+    """`initial_points` of an object with masks."""
+    mesh = hull.surface(hull.visual_hull(views))
+    positions, normals = sample_surface(*mesh, count, rng)
+    if compare:
+        maps = stereo.verified(stereo.depth_maps(views, mesh[:2], quiet))
+        gone, tree = seen_through(positions, maps), spatial.KDTree(positions)
+        below = oriented_points(maps, _DEEPER * int(gone.sum()), rng, lambda above: gone[tree.query(above, workers=-1)[1]])
+        if not gone.all():
+            positions, normals = (np.concatenate([on[~gone], new]) for on, new in zip((positions, normals), below))
+    spacing = _spacing(positions)
+    depths = hull.depth_maps(*mesh[:2], [view.camera for view in views])
+    return positions, normals, _colors(positions, views, depths, 2 * float(np.median(spacing))), spacing
 
 
 def surroundings(dataset: Dataset, count: int, seed: int = 0) -> Points:

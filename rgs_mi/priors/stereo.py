@@ -1,18 +1,18 @@
-"""What lies below the visual hull, seen by the photographs: a plane sweep, with the hull's own shape as the plane
-(docs/method.md §5).
+"""What photographs say of depth, without a network: a plane sweep, and what its depth maps agree on (docs/method.md §5).
 
-    1. `sweep`   Each view asks, pixel by pixel, how deep below the hull its surroundings look alike in the views next to it:
-                 normalized cross-correlation over a window, the mean of the best few (Collins 1996, Goesele et al. 2006).
-    2. `_agreed` A mirror image is alike somewhere below the hull, too, but elsewhere for other views. A point counts where
-                 most of the views that find something in its direction find it there, and its surroundings do as well: on
-                 flat mirrors, views agree by chance here and there.
-    3. `carve`   Grid nodes that several views look through are carved off the hull's field.
+    1. `sweep`        Each view asks, pixel by pixel, at which of many depths its surroundings look alike in the views next to it:
+                      normalized cross-correlation over a window, the mean of the best few (Collins 1996, Goesele et al. 2006).
+                      With masks the depths lie below the visual hull, in its own shape; without, at equal steps of inverse
+                      depth through all that the cameras see.
+    2. `agreement`    A mirror image is alike at some depth, too, but elsewhere for other views; and what repeats is alike at
+                      many. A point counts where most of the views that could see it have it at its depth, and few look
+                      through it.
 
-So a cup gets its inside, and a ball of chrome stays one. Nothing here needs a network.
+So a cup gets its inside, a ball of chrome stays one, and a scene without masks gets a surface.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -21,45 +21,23 @@ from scipy import ndimage
 from skimage.transform import downscale_local_mean
 
 from ..core.arrays import as_float
-from ..core.camera import Camera, opaque, pixel_rays
+from ..core.camera import Camera, focus_point, opaque, pixel_rays
 from ..core.progress import Progress
 from ..datasets.types import View
 from . import hull
 
-_WIDTH = 200  # pixels of a photograph's copy at most
-_STEPS = 160  # of the grid that is carved, at most; the hull's own may be finer
-_LEVELS = 40  # depths below the hull
+_PIXELS = 400**2  # of a photograph's copy, about
+_LEVELS, _ABOVE = 44, 4  # depths below the hull; those of them that lie above it
 _REACH = 0.75  # the deepest, over the hull's radius
+_INVERSE_LEVELS = 128  # depths where there is no hull
+_NEAREST = 0.25  # of these, over the least distance of a camera from what all look at
 _NEIGHBOURS, _BEST = 6, 3  # views that each is compared with, and those of them that count
+_BASELINE, _WIDEST = 10.0, 35.0  # degrees between the directions to two neighbours: wished, and at most
 _WINDOW = 2  # pixels on each side
-_ALIKE, _GAIN = 0.75, 0.15  # correlation that is enough, and how much above the hull's own it must be
-_ABOVE = 2  # levels that count as the hull itself
-_SAME = 1.5  # levels between two views' depths that are the same
-_AGREED, _VIEWS = 0.4, 3  # part and count of views that must find the same
-_AROUND, _SURROUNDINGS = 0.45, 10  # their part in the mean over the surroundings: standard deviation of these, in levels
-_CELL = 2  # levels across a cell, of which that mean is made
-_SEEN_THROUGH = 3  # views that look through what is carved
 _FLAT = 1e-4  # variance of grey levels in a window that shows nothing
-
-
-def carved_hull(views: Sequence[View], resolution: int | None = None, quiet: bool = True) -> hull.SignedField:
-    """Return the `hull.visual_hull` of ``views``, less what they look through; ``quiet`` shows no progress. A JIT variant
-    must be active. Raises: UserError as `hull.visual_hull` does."""
-    with Progress(quiet=quiet, label="carving the visual hull") as progress:
-        field, rough = hull.visual_hulls(views, resolution, min(resolution or _STEPS, _STEPS))
-        vertices, faces, _ = hull.surface(rough)
-        small = [SmallImage.of(view) for view in views]
-        depths = hull.depth_maps(vertices, faces, [s.camera for s in small])
-        radius = float(np.linalg.norm(vertices - vertices.mean(0), axis=1).max())
-        step = _REACH * radius / _LEVELS
-        progress.update(0)
-        deeper = []
-        for i in range(len(small)):
-            deeper.append(sweep(i, small, depths, step))
-            progress.update((i + 1) / (len(small) + 1), views=i + 1)
-        cut = carve(rough, small, depths, _agreed(small, depths, deeper, step), step)
-        progress.update(1)
-        return _least(field, cut)
+_SAME = 1.5  # levels between two depths that are the same
+_WITNESSES = 16  # views that are asked whether they agree
+_VIEWS, _AGREED = 2, 0.5  # of them, at least, and their part of those that look there
 
 
 @dataclass(frozen=True)
@@ -71,9 +49,9 @@ class SmallImage:
 
     @classmethod
     def of(cls, view: View) -> "SmallImage":
-        """Return the copy of a view's photograph, of `_WIDTH` pixels at most."""
+        """Return the copy of a view's photograph, of `_PIXELS` pixels at most, or nearly so."""
         width, height = view.camera.size
-        factor = max(1, -(-width // _WIDTH))
+        factor = max(1, int(np.ceil(np.sqrt(width * height / _PIXELS) - 0.1)))
         pixels = view.pixels / np.float32(255) if view.pixels.dtype == np.uint8 else view.pixels
         grey = np.clip(pixels[..., :3], 0, 1).mean(-1) * pixels[..., 3] + 1 - pixels[..., 3]
         w, h = width // factor, height // factor
@@ -81,127 +59,183 @@ class SmallImage:
         camera = view.camera.cropped(0, 0, w * factor, h * factor).resized(w, h)
         return cls(camera, np.ascontiguousarray(grey, np.float32))
 
-    def cropped(self, window: tuple[slice, slice]) -> "SmallImage":
-        """Return the same image within ``window``, slices of rows and columns."""
-        rows, columns = window
-        camera = self.camera.cropped(columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start)
-        return SmallImage(camera, np.ascontiguousarray(self.grey[window]))
+    @property
+    def normalized(self) -> np.ndarray:
+        """The grey levels less their mean over the window around each pixel, over its standard deviation, [H, W]."""
+        mean, square = (ndimage.uniform_filter(self.grey.astype(np.float64) ** k, 2 * _WINDOW + 1) for k in (1, 2))
+        return ((self.grey - mean) / np.sqrt(np.maximum(square - mean**2, _FLAT))).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class DepthMap:
+    """What a sweep found in one view.
+
+    camera     of the small copy
+    depth      [H, W] z-depth in world units, NaN where nothing was looked for
+    likeness   [H, W] how alike the views are there: the mean of the best correlations, in [−1, 1]
+    tolerance  [H, W] how far apart two depths may be, there, that are the same, in world units
+    hull       [H, W] z-depth of the visual hull, NaN beside it; None without masks
+    """
+
+    camera: Camera
+    depth: np.ndarray
+    likeness: np.ndarray
+    tolerance: np.ndarray
+    hull: np.ndarray | None = None
+
+
+def depth_maps(views: Sequence[View], mesh: tuple | None = None, quiet: bool = True) -> list[DepthMap]:
+    """Sweep all ``views``; ``mesh`` are the vertices and faces of their `hull.surface`, None where they have no masks. ``quiet``
+    shows no progress. A JIT variant must be active."""
+    with Progress(quiet=quiet, label="comparing the photographs") as progress:
+        small = [SmallImage.of(view) for view in views]
+        cameras, images = [s.camera for s in small], [s.normalized for s in small]
+        surfaces = [None] * len(small) if mesh is None else hull.depth_maps(*mesh, cameras)
+        levels, step = _levels(cameras, mesh)
+        target = focus_point(cameras)[0] if mesh is None else mesh[0].mean(0)
+        maps = []
+        for i in range(len(small)):
+            maps.append(_depth_map(i, cameras, images, surfaces, levels, step, neighbours(i, cameras, target)))
+            progress.update((i + 1) / len(small), views=i + 1)
+        return maps
+
+
+def _levels(cameras, mesh):
+    """The depths of a sweep and the distance of two of them: depths below the hull, or, without one, inverse depths."""
+    if mesh is not None:
+        step = _REACH * float(np.linalg.norm(mesh[0] - mesh[0].mean(0), axis=1).max()) / (_LEVELS - _ABOVE)
+        return (np.arange(_LEVELS) - _ABOVE) * step, step
+    center = focus_point(cameras)[0]
+    nearest = _NEAREST * min(np.linalg.norm(c.origin - center) for c in cameras)
+    levels = np.linspace(1 / nearest, 0, _INVERSE_LEVELS, endpoint=False)
+    return levels, levels[0] - levels[1]
+
+
+def neighbours(i: int, cameras: Sequence[Camera], target: np.ndarray, count: int = _NEIGHBOURS) -> list[int]:
+    """Return the indices of the ``count`` cameras to compare camera ``i`` with: those that see ``target`` [3] from some ten
+    degrees beside it, and look the same way."""
+    away = np.array([c.origin for c in cameras]) - target
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+    forward = np.array([c.rotation[2] for c in cameras])
+    angle, turn = (np.degrees(np.arccos(np.clip(v @ v[i], -1, 1))) for v in (away, forward))
+    cost = np.abs(np.log(np.maximum(angle, 0.1) / _BASELINE)) + turn / 60
+    cost[(angle > _WIDEST) | (np.arange(len(cameras)) == i)] = np.inf
+    return [int(j) for j in np.argsort(cost)[:count] if np.isfinite(cost[j])]
+
+
+def _depth_map(i, cameras, images, surfaces, levels, step, others):
+    """The `DepthMap` of view ``i``."""
+    (width, height), surface = cameras[i].size, surfaces[i]
+    known = np.ones((height, width), bool) if surface is None else np.isfinite(surface)
+    depth, likeness = np.full((height, width), np.nan, np.float32), np.zeros((height, width), np.float32)
+    tolerance = np.full((height, width), _SAME * step, np.float32)
+    if len(others) < 2 or not known.any():
+        return DepthMap(cameras[i], depth, likeness, tolerance, surface)
+    (window,) = ndimage.find_objects(known.astype(np.int8))
+    rows, columns = window
+    camera = cameras[i].cropped(columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start)
+    base = np.zeros(known.shape) if surface is None else np.where(known, surface, np.nanmax(surface))
+    at = lambda level: 1 / level if surface is None else base[window] + level
+    score = sweep(
+        camera,
+        images[i][window],
+        [at(level) for level in levels],
+        [(cameras[j], images[j], surfaces[j]) for j in others],
+        (_SAME + 0.5) * step,
+    )
+    best, offset, likeness[window] = _peak(score)
+    found = at(np.interp(best + offset, np.arange(len(levels)), levels))
+    depth[window] = np.where(known[window], found, np.nan)
+    if surface is None:
+        tolerance[window] = _SAME * step * found**2
+    return DepthMap(cameras[i], depth, np.where(known, likeness, 0), tolerance, surface)
+
+
+def _peak(score):
+    """Where the greatest of ``score`` [L, H, W] is in each pixel: its level, its place between levels by a parabola, and its
+    value."""
+    best = score.argmax(0)
+    middle = np.clip(best, 1, len(score) - 2)
+    before, here, after = (np.take_along_axis(score, (middle + k)[None], 0)[0] for k in (-1, 0, 1))
+    bend = before - 2 * here + after
+    offset = np.where((middle == best) & (bend < -1e-6), 0.5 * (before - after) / np.minimum(bend, -1e-6), 0)
+    return best, np.clip(offset, -0.5, 0.5), score.max(0)
 
 
 # ---- How alike ----
 
 
-def sweep(i: int, small: Sequence[SmallImage], depths: Sequence[np.ndarray], step: float) -> np.ndarray:
-    """Return how much deeper than the hull the surface of view ``i`` lies, [H, W], world units along the viewing axis; 0
-    where it is the hull, or nothing can be told. ``depths`` [H, W] are the hull's in all views, NaN beside it, and ``step``
-    lies between two levels."""
-    deeper, known = np.zeros_like(depths[i]), np.isfinite(depths[i])
-    if not known.any():
-        return deeper
-    (window,) = ndimage.find_objects(known.astype(np.int8))
-    here, depth, known = small[i].cropped(window), depths[i][window], known[window]
-    level = (np.arange(_LEVELS) - _ABOVE / 2) * step
-    mean = photo_consistency(here, depth, level, [(small[j], depths[j]) for j in _next_to(i, small)], 2 * step)
-    mean[:, ~np.asarray(ndimage.binary_erosion(known, iterations=_WINDOW), bool)] = -1
-    found, top = mean.argmax(0), mean.max(0)
-    sure = (found > _ABOVE) & (found < _LEVELS - 2) & (top > _ALIKE) & (top - mean[: _ABOVE + 1].max(0) > _GAIN)
-    deeper[window] = np.where(sure, level[found], 0)
-    return deeper
-
-
-def _next_to(i, small):
-    """Indices of the views that look most nearly the same way as view ``i``."""
-    forward = np.array([s.camera.rotation[2] for s in small])
-    alike = forward @ forward[i]
-    alike[i] = -np.inf
-    return np.argsort(-alike)[: min(_NEIGHBOURS, len(small) - 1)]
-
-
-def photo_consistency(
-    here: SmallImage,
-    depth: np.ndarray,
-    level: np.ndarray,
-    others: Sequence[tuple[SmallImage, np.ndarray]],
-    margin: float,
+def sweep(
+    camera: Camera,
+    image: np.ndarray,
+    depths: Sequence[np.ndarray | float],
+    others: Sequence[tuple[Camera, np.ndarray, np.ndarray | None]],
+    margin: float = 0.0,
 ) -> np.ndarray:
-    """Return how much the surroundings of each pixel of ``here`` look like what ``others``, pairs of an image and its hull's
-    depth, show if it lies at ``depth`` [H, W] + ``level`` [L]: [L, H, W], the mean of the best few correlations, at least
-    −1. That with a view whose frame the point is not in, or whose hull it is more than ``margin`` above, is −1."""
-    best = [mi.Float(-1)] * _BEST
-    points, own = _points(here.camera, depth, level), _own(here.grey, len(level))
-    for other, surface in others:
-        score = _correlation(own, *_warp(points, other, surface, margin), depth.shape)
-        for k in range(_BEST):  # keep the largest, in order
-            best[k], score = dr.maximum(best[k], score), dr.minimum(best[k], score)
-        dr.eval(best)
-    return np.array(sum(best) / _BEST).reshape(len(level), *depth.shape)
+    """Return how much the surroundings of each pixel of ``image`` look like what ``others`` show if it lies at each of
+    ``depths``: [L, H, W], the mean of the best few correlations, at least −1.
+
+    Args:
+      camera, image: of the view, [H, W], as `SmallImage.normalized`
+      depths: L times z-depths [H, W], or one of all pixels, in world units
+      others: the same of other views, and of each its hull's depth, NaN beside it, or None. A view counts where the point is in
+        its frame and not more than ``margin`` above its hull
+    """
+    height, width = image.shape
+    index = dr.arange(mi.UInt32, height * width)
+    rays, own, origin = pixel_rays(camera, index), as_float(image), opaque(camera)[1]
+    scores = []
+    placed = [
+        (other, as_float(shown), None if hull is None else as_float(np.nan_to_num(hull, nan=np.inf)))
+        for other, shown, hull in others
+    ]
+    dr.eval(rays, own)
+    for depth in depths:
+        z = as_float(depth) if np.ndim(depth) else dr.opaque(mi.Float, float(depth))
+        point = origin + rays * z
+        found = [_warp(point, *other, margin) for other in placed]
+        means = _means([dr.select(inside, value * own, -1) for value, inside in found], width, height)
+        best = [mi.Float(-1)] * min(_BEST, len(placed))
+        for mean, (_, inside) in zip(means, found):
+            mean = dr.select(inside, mean, -1)
+            for k in range(len(best)):  # keep the largest, in order
+                best[k], mean = dr.maximum(best[k], mean), dr.minimum(best[k], mean)
+        scores.append(sum(best) / len(best))
+        dr.eval(scores[-1])
+    return np.stack([score.numpy().reshape(height, width) for score in scores])
 
 
-def _points(camera, depth, level):
-    """World points below the hull, one entry per level and pixel."""
-    filled = np.where(np.isfinite(depth), depth, np.nanmax(depth))
-    entry, n = dr.arange(mi.UInt32, filled.size * len(level)), dr.opaque(mi.UInt32, filled.size)
-    pixel = entry % n
-    z = dr.gather(mi.Float, as_float(filled), pixel) + dr.gather(mi.Float, as_float(level), entry // n)
-    point = opaque(camera)[1] + pixel_rays(camera, pixel) * z
-    dr.eval(point)
-    return point
-
-
-def _warp(points, other, depth, margin):
-    """(grey levels of the ``other`` photograph at ``points``, whether these can be its surface: in its frame, not above its
+def _warp(point, other, image, surface, margin):
+    """(values of the ``other`` view's ``image`` at ``point``, whether that can be its surface: in its frame, not above its
     hull)."""
     constant = lambda x: dr.opaque(mi.Float, float(x))
-    rotation, origin, focal, principal = opaque(other.camera)
-    width, height = other.camera.size
-    local = rotation @ mi.Vector3f(points - origin)
+    rotation, origin, focal, principal = opaque(other)
+    width, height = other.size
+    local = rotation @ mi.Vector3f(point - origin)
     x = local.x / local.z * focal.x + principal.x - 0.5
     y = local.y / local.z * focal.y + principal.y - 0.5
     inside = (local.z > 0) & (x >= 0) & (y >= 0) & (x < constant(width - 1)) & (y < constant(height - 1))
     column, row = dr.floor(x), dr.floor(y)
     at = mi.UInt32(dr.select(inside, row * constant(width) + column, 0))
-    grey, right, below = as_float(other.grey), dr.opaque(mi.UInt32, 1), dr.opaque(mi.UInt32, width)
-    fetch = lambda k: dr.gather(mi.Float, grey, at + k, inside)
+    right, below = dr.opaque(mi.UInt32, 1), dr.opaque(mi.UInt32, width)
+    fetch = lambda k: dr.gather(mi.Float, image, at + k, inside)
     fx, fy = x - column, y - row
     value = dr.lerp(dr.lerp(fetch(0), fetch(right), fx), dr.lerp(fetch(below), fetch(below + right), fx), fy)
-    surface = dr.gather(mi.Float, as_float(np.where(np.isfinite(depth), depth, np.inf)), at, inside)
-    inside &= local.z > surface - constant(margin)
-    value = dr.select(inside, value, 1)
-    dr.eval(value, inside)
+    if surface is not None:
+        inside &= local.z > dr.gather(mi.Float, surface, at, inside) - constant(margin)
     return value, inside
 
 
-def _own(grey, levels):
-    """``grey``, its means and its mean squares over windows, one entry per level and pixel."""
-    pixel = dr.arange(mi.UInt32, grey.size * levels) % dr.opaque(mi.UInt32, grey.size)
-    means = (ndimage.uniform_filter(grey.astype(np.float64) ** k, 2 * _WINDOW + 1, mode="nearest") for k in (1, 2))
-    own = [dr.gather(mi.Float, as_float(image), pixel) for image in (grey, *means)]
-    dr.eval(own)
-    return own
-
-
-def _correlation(own, warped, inside, shape):
-    """Normalized cross-correlation of the windows around each pixel, whose `_own` these are, and of its ``warped``
-    neighbour."""
-    here, mean, square = own
-    m, mm, cross = _means([warped, warped * warped, warped * here], *shape[::-1])
-    spread = dr.sqrt(dr.maximum(square - mean * mean, _FLAT) * dr.maximum(mm - m * m, _FLAT))
-    score = dr.select(inside, (cross - m * mean) / spread, -1)
-    dr.eval(score)
-    return score
-
-
 def _means(images, width, height):
-    """Means over windows of stacks of images, which end at each image's borders."""
-    entry = dr.arange(mi.UInt32, dr.width(images[0]))
+    """Means of ``images`` over windows, which end at the border."""
+    index = dr.arange(mi.UInt32, width * height)
     columns, rows = dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, height)
-    for position, extent, stride in ((entry % columns, columns, 1), (entry // columns % rows, rows, columns)):
+    for position, extent, stride in ((index % columns, columns, 1), (index // columns, rows, columns)):
         dr.eval(images)
         sums = [mi.Float(0)] * len(images)
         for offset in range(-_WINDOW, _WINDOW + 1):
-            moved = mi.Int32(position) + offset
-            moved = dr.clip(moved, 0, mi.Int32(extent) - 1) - mi.Int32(position)
-            at = mi.UInt32(mi.Int32(entry) + moved * mi.Int32(stride))
+            moved = dr.clip(mi.Int32(position) + offset, 0, mi.Int32(extent) - 1) - mi.Int32(position)
+            at = mi.UInt32(mi.Int32(index) + moved * mi.Int32(stride))
             sums = [s + dr.gather(mi.Float, image, at) for s, image in zip(sums, images)]
         images = [s / (2 * _WINDOW + 1) for s in sums]
     return images
@@ -210,75 +244,51 @@ def _means(images, width, height):
 # ---- What views agree on ----
 
 
-def _agreed(small, depths, deeper, step):
-    """``deeper``, 0 where its points are not what the other views that look for them there have found, most of the time."""
-    sure = [below > 0 for below in deeper]
-    points = np.concatenate(
-        [
-            s.camera.origin + s.camera.rays()[where] * (depth + below)[where][:, None]
-            for s, depth, below, where in zip(small, depths, deeper, sure)
-        ]
-    )
-    found, agree = np.zeros((2, len(points)), np.int64)
-    for s, depth, below in zip(small, depths, deeper):
-        z, (at, below_at) = _look(s.camera, points, depth, below)
-        found += below_at > 0
-        agree += (below_at > 0) & (abs(z - at - below_at) < _SAME * step)
-    agreed = agree / np.maximum(found, 1)  # its own view is one of them
-    kept = (agree > _VIEWS) & (agreed > _AGREED) & (_mean_around(points, agreed, step) > _AROUND)
-    for below, where, part in zip(deeper, sure, np.split(kept, np.cumsum([w.sum() for w in sure])[:-1])):
-        below[where] *= part
-    return deeper
+def verified(maps: Sequence[DepthMap]) -> list[DepthMap]:
+    """Return ``maps`` with no likeness left where most of the neighbouring views that look there find another depth, and in
+    places where that holds for most pixels around."""
+    cameras = [m.camera for m in maps]
+    center = focus_point(cameras)[0]
+    kept = []
+    for i, m in enumerate(maps):
+        index = dr.arange(mi.UInt32, m.depth.size)
+        depth = as_float(np.nan_to_num(m.depth))
+        points = opaque(m.camera)[1] + pixel_rays(m.camera, index) * depth
+        dr.eval(points)
+        count, same, through = _agreement(points, [maps[j] for j in neighbours(i, cameras, center, _WITNESSES)])
+        alike = (count >= _VIEWS) & (same > _AGREED * (same + through)) & (depth > 0)
+        alike = alike.numpy().reshape(m.depth.shape).astype(np.float32)
+        alike *= ndimage.uniform_filter(alike, 2 * _WINDOW + 1) > _AGREED
+        kept.append(replace(m, likeness=m.likeness * alike))
+    return kept
 
 
-def _mean_around(points, values, step):
-    """[N] mean of ``values`` [N] over the surroundings of ``points`` [N, 3]."""
-    if not len(points):
-        return values
-    cell = np.floor((points - points.min(0)) / (_CELL * step)).astype(np.intp)
-    shape = cell.max(0) + 1
-    total, count = np.zeros(shape), np.zeros(shape)
-    np.add.at(total, tuple(cell.T), values)
-    np.add.at(count, tuple(cell.T), 1)
-    blurred = lambda sums: ndimage.gaussian_filter(sums, _SURROUNDINGS / _CELL, mode="constant")[tuple(cell.T)]
-    return blurred(total) / blurred(count)
+def agreement(points: np.ndarray, maps: Sequence[DepthMap]) -> tuple[np.ndarray, np.ndarray]:
+    """Return how many of ``maps`` have a surface at each of ``points`` [N, 3], and how many look through it at something farther,
+    [N] each; a view counts by its likeness there."""
+    p = mi.Point3f(*(as_float(np.ascontiguousarray(x)) for x in np.asarray(points, np.float32).T))
+    _, same, through = _agreement(p, maps)
+    return same.numpy(), through.numpy()
 
 
-def _look(camera, points, *maps):
-    """(z-depths of ``points``, the entries of ``maps`` where they are seen, NaN beyond the frame)."""
-    pixel, z = camera.project(points)
-    column, row = np.floor(pixel).astype(np.int64).T
-    inside = (z > 0) & (column >= 0) & (row >= 0) & (column < camera.size[0]) & (row < camera.size[1])
-    values = [np.full(len(points), np.nan, np.float32) for _ in maps]
-    for value, image in zip(values, maps):
-        value[inside] = image[row[inside], column[inside]]
-    return z, values
-
-
-def carve(
-    field: hull.SignedField,
-    small: Sequence[SmallImage],
-    depths: Sequence[np.ndarray],
-    deeper: Sequence[np.ndarray],
-    step: float,
-) -> hull.SignedField:
-    """Return the field of what is left of ``field`` without the nodes through which several views look at something deeper,
-    close to these; elsewhere three steps inside. ``depths`` are the hull's, ``deeper`` what `sweep` adds to them."""
-    inside = np.argwhere(field.values > 0)
-    points = field.lower + field.step * inside
-    through = np.zeros(len(points), np.int64)
-    for s, depth, below in zip(small, depths, deeper):
-        z, (at, below_at) = _look(s.camera, points, depth, below)
-        through += (below_at > 0) & (z < at + below_at - step)
-    gone = np.zeros(field.values.shape, bool)
-    gone[tuple(inside[through >= _SEEN_THROUGH].T)] = True
-    values = ndimage.gaussian_filter(np.where(gone, -field.step, field.values), 1.0)
-    values[~np.asarray(ndimage.binary_dilation(gone, iterations=2), bool)] = 3 * field.step
-    return hull.SignedField(values, field.lower, field.step)
-
-
-def _least(field, other):
-    """The lesser of two fields, on the grid of the first."""
-    scale, offset = field.step / other.step, (field.lower - other.lower) / other.step
-    values = ndimage.affine_transform(other.values, np.full(3, scale), offset, field.values.shape, order=1, mode="nearest")
-    return hull.SignedField(np.minimum(field.values, values), field.lower, field.step)
+def _agreement(points, maps):
+    """`agreement` of Dr.Jit's ``points``, after the number of ``maps`` that have a surface there."""
+    count, same, through = (dr.zeros(mi.Float, dr.width(points)) for _ in range(3))
+    for m in maps:
+        rotation, origin, focal, principal = opaque(m.camera)
+        local = rotation @ mi.Vector3f(points - origin)
+        x, y = local.x / local.z * focal.x + principal.x, local.y / local.z * focal.y + principal.y
+        width, height = (dr.opaque(mi.Float, float(n)) for n in m.camera.size)
+        inside = (local.z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        at = mi.UInt32(dr.select(inside, dr.floor(y) * width + dr.floor(x), 0))
+        depth, likeness, tolerance = (
+            dr.gather(mi.Float, as_float(v), at, inside) for v in (np.nan_to_num(m.depth), m.likeness, m.tolerance)
+        )
+        weight = dr.select(inside & (depth > 0), dr.maximum(likeness, 0), 0)
+        farther = depth - local.z
+        meets = dr.abs(farther) <= tolerance
+        count += dr.select(meets & (weight > 0), mi.Float(1), 0)
+        same += dr.select(meets, weight, 0)
+        through += dr.select(farther > tolerance, weight, 0)
+        dr.eval(count, same, through)
+    return count, same, through

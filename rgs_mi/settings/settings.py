@@ -38,7 +38,11 @@ class Initialization:
         default=True,
         description="Surfels start on the visual hull where photographs have masks, else on the data set's points, or at random.",
     )
-    carve: bool = Field(default=True, description="The hull is carved first: it loses what photographs look through.")
+    compare: bool = Field(
+        default=True,
+        description="Photographs are compared first: surfels start where they agree on a depth, and not where they look through "
+        "the hull.",
+    )
     scale: float = Field(
         default=0.8, ge=0.01, le=10, description="Standard deviation of a surfel over the distance to its neighbours."
     )

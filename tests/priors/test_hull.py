@@ -13,6 +13,7 @@ from rgs_mi.datasets import load_dataset, path_traced
 from rgs_mi.datasets.types import Dataset, View
 from rgs_mi.priors import hull
 from rgs_mi.priors.initialization import initial_points
+from rgs_mi.priors.sampling import sample_surface
 
 CENTRE, RADIUS, SIZE, VIEWS = np.array([0.7, -0.4, 0.3]), 0.5, 96, 40
 RGB = np.array([200, 100, 50])
@@ -191,14 +192,14 @@ def test_depth_maps(mesh):
 
 
 def test_samples_are_spread_evenly(mesh):
-    positions, normals = hull.sample_surface(*mesh, 2000, np.random.default_rng(0))
+    positions, normals = sample_surface(*mesh, 2000, np.random.default_rng(0))
     assert positions.shape == normals.shape == (2000, 3) and positions.dtype == np.float32
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-5)
     assert ((positions - CENTRE) * normals).sum(1).min() > 0
     nearest = spatial.cKDTree(positions).query(positions, 2)[0][:, 1]
     random = 0.5 * np.sqrt(4 * np.pi * RADIUS**2 / 2000)  # what independent samples have
     assert nearest.mean() > 1.4 * random and np.percentile(nearest, 5) > random
-    again, _ = hull.sample_surface(*mesh, 2000, np.random.default_rng(0))
+    again, _ = sample_surface(*mesh, 2000, np.random.default_rng(0))
     np.testing.assert_array_equal(positions, again)
 
 
@@ -207,7 +208,7 @@ def test_samples_are_denser_where_a_mesh_bends():
     q = np.abs(np.stack(np.meshgrid(x, x, x, indexing="ij"), -1)) - 0.5
     cube = -(np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0))
     mesh = hull.surface(hull.SignedField(cube.astype(np.float32), np.full(3, -0.7), 0.02))
-    positions, _ = hull.sample_surface(*mesh, 3000, np.random.default_rng(0))
+    positions, _ = sample_surface(*mesh, 3000, np.random.default_rng(0))
     second = np.sort(np.abs(positions), axis=1)[:, 1]  # 0.5 at an edge
     strips = [(low < second) & (second < low + 0.02) for low in (0.2, 0.475)]
     areas = [8 * (low + 0.02) ** 2 - 8 * low**2 for low in (0.2, 0.475)]  # of square frames, up to a factor

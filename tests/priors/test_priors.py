@@ -60,11 +60,9 @@ def test_names_and_options():
     fails("prior 'files'.*missing.*'folder'.*options are folder, inverse, suffix", "files", [])
 
 
-@pytest.mark.parametrize("name", ["hull", "stereo"])
-def test_hull(name):
-    """Stereo carves nothing off a ball of one colour."""
+def test_hull():
     views = ball()
-    priors = depth_priors(name, views, resolution=48)
+    priors = depth_priors("hull", views, resolution=48)
     for prior, v in zip(priors, views):
         assert prior.values.shape == (40, 40) and prior.values.dtype == np.float32 and not prior.inverse
         seen = np.isfinite(prior.values)

@@ -1,4 +1,4 @@
-"""Carving the visual hull by what photographs look through: a tray with a floor, and things that must stay."""
+"""What photographs agree on, and look through: a tray with a floor, and things that must stay; kernels against loops."""
 
 import functools
 
@@ -8,8 +8,11 @@ import pytest
 from scipy import ndimage
 
 from rgs_mi.core.camera import Camera
-from rgs_mi.datasets.types import View
+from rgs_mi.datasets.types import Dataset, View
 from rgs_mi.priors import hull, stereo
+from rgs_mi.priors.initialization import initial_points
+from rgs_mi.priors.sampling import thinned
+from rgs_mi.priors.surface_points import oriented_points, seen_through, smoothed
 
 SIZE, VIEWS = 128, 48
 RIM, FLOOR, HALF, INNER = 0.25, -0.1, 0.5, 0.42  # of the tray: heights, half widths outside and inside
@@ -87,33 +90,44 @@ def photographs(shapes, distance=2.2):
     return views
 
 
-def kept(views, *regions):
-    """A pair (before, after) for each of ``regions``, functions of x, y, z: the part of its nodes that hull and carved hull
-    fill."""
-    parts = []
-    for field in (hull.visual_hull(views, 64), stereo.carved_hull(views, 64)):
-        x, y, z = np.indices(field.values.shape) * field.step + field.lower[:, None, None, None]
-        parts.append([(field.values[inside(x, y, z)] > 0).mean() for inside in regions])
-    return list(zip(*parts))
+def in_cavity(x, y, z):
+    return (abs(x) < INNER - 0.04) & (abs(y) < INNER - 0.04) & (z > FLOOR + 0.04) & (z < RIM + 0.04)
 
 
-def cavity(x, y, z):
-    return (abs(x) < INNER - 0.07) & (abs(y) < INNER - 0.07) & (z > FLOOR + 0.06) & (z < RIM - 0.05)
+def on_floor(x, y, z):
+    return (abs(x) < INNER - 0.04) & (abs(y) < INNER - 0.04) & (abs(z - FLOOR) < 0.03)
 
 
-def body(x, y, z):
-    return (abs(x) < HALF - 0.04) & (abs(y) < HALF - 0.04) & (z < FLOOR - 0.05) & (z > -RIM + 0.04)
+def starts(views):
+    """Positions and normals of the first points on the hull, and those where photographs were compared."""
+    return [initial_points(Dataset(views, []), 4000, compare=compare)[:2] for compare in (False, True)]
 
 
 def test_a_tray_gets_its_inside():
-    (before, after), (_, left) = kept(textured_tray(), cavity, body)
-    assert before > 0.95 and after < 0.2
-    assert left > 0.97
+    (lid, _), (points, normals) = starts(textured_tray())
+    assert in_cavity(*lid.T).mean() > 0.1
+    assert in_cavity(*points.T).mean() < 0.02
+    floor = on_floor(*points.T)
+    assert floor.mean() > 0.05 and np.median(normals[floor, 2]) > 0.95
+    outside = lambda p: (p[:, 2] < FLOOR).sum()
+    assert outside(points) > 0.97 * outside(lid)
 
 
-def test_without_texture_nothing_is_carved():
-    ((before, after),) = kept(photographs(tray(0.0)), cavity)
-    assert after == before
+def test_without_masks_points_lie_on_surfaces_too():
+    bare = [View(v.name, v.camera, v.pixels | np.uint8([0, 0, 0, 255]), False, None, None) for v in textured_tray()]
+    points, normals = oriented_points(stereo.verified(stereo.depth_maps(bare)), 3000, np.random.default_rng(0))
+    assert len(points) > 1000
+    x, y, z = points.T
+    walls = [abs(abs(c) - w) < 0.04 for c in (x, y) for w in (INNER, HALF)]
+    on_surface = np.any([*walls, abs(z - FLOOR) < 0.04, abs(z - RIM) < 0.04, abs(z + RIM) < 0.04], 0)
+    assert on_surface.mean() > 0.9
+    assert np.median(normals[on_floor(x, y, z), 2]) > 0.9
+
+
+def test_without_texture_nothing_changes():
+    (hull_points, _), (points, _) = starts(photographs(tray(0.0)))
+    assert len(points) == pytest.approx(len(hull_points), rel=0.05)
+    assert in_cavity(*points.T).sum() == pytest.approx(in_cavity(*hull_points.T).sum(), rel=0.1)
 
 
 def test_a_mirror_stays():
@@ -122,70 +136,99 @@ def test_a_mirror_stays():
     noise = np.float32(np.clip(0.5 + 0.25 * noise / noise.std(), 0, 1)).repeat(3, 2)
     light = {"type": "envmap", "bitmap": mi.Bitmap(noise)}
     ball = {"type": "sphere", "radius": 0.5, "bsdf": {"type": "conductor", "material": "none"}}
-    views = photographs({"light": light, "ball": ball})
-    ((_, left),) = kept(views, lambda x, y, z: x**2 + y**2 + z**2 < 0.45**2)
-    assert left > 0.99
+    (on_hull, _), (points, _) = starts(photographs({"light": light, "ball": ball}))
+    assert len(points) > 0.99 * len(on_hull)
+    assert (np.linalg.norm(points, axis=1) < 0.45).mean() < 0.01
 
 
-def test_what_is_cut_off_a_fine_hull_is_what_the_rough_one_lost():
-    """A ball on a grid, a half-space on a coarser one that does not share its nodes: their intersection."""
-
-    def grid(lower, step, count, value):
-        x, y, z = lower + step * np.indices((count,) * 3)
-        return hull.SignedField(value(x, y, z).astype(np.float32), np.full(3, lower), step)
-
-    ball = grid(-0.6, 0.02, 61, lambda x, y, z: 0.5 - np.sqrt(x**2 + y**2 + z**2))
-    below = grid(-0.73, 0.05, 30, lambda x, y, z: 0.1 - z)
-    least = stereo._least(ball, below)
-    z = ball.lower[2] + ball.step * np.arange(61)
-    np.testing.assert_allclose(least.values, np.minimum(ball.values, 0.1 - z), atol=1e-6)
-    np.testing.assert_array_equal(least.lower, ball.lower)
-
-
-def test_views_that_agree_by_chance_do_not_count():
-    """A tenth of the points of one heap, and all of another's: only the latter's surroundings agree with them."""
-    rng, step = np.random.default_rng(0), 0.01
-    heaps = np.array([0, 1]).repeat(2000)
-    points = rng.normal(size=(4000, 3)) * 5 * step + 80 * step * heaps[:, None]
-    agreed = np.where(heaps | (rng.random(4000) < 0.1), 0.8, 0.1)
-    around = stereo._mean_around(points, agreed, step)
-    assert around[heaps == 0].max() < stereo._AROUND < around[heaps == 1].min()
-    near = np.exp(-0.5 * ((points[:50, None] - points) ** 2).sum(-1) / (stereo._SURROUNDINGS * step) ** 2)
-    assert around[:50] == pytest.approx((near * agreed).sum(1) / near.sum(1), abs=0.02)
-
-
-def test_photo_consistency_is_what_loops_say():
-    """Every correlation of a few pixels, window by window, in NumPy."""
+def test_a_sweep_is_what_loops_say():
+    """Every score of a few pixels, window by window, in NumPy."""
     every = textured_tray()
-    views = every[:5]
-    small = [stereo.SmallImage.of(view) for view in views]
+    small = [stereo.SmallImage.of(view) for view in every[:5]]
     mesh = hull.surface(hull.visual_hull(every, 48))
     depths = hull.depth_maps(*mesh[:2], [s.camera for s in small])
-    level, margin = np.array([-0.02, 0.05, 0.2]), 0.03
-    mine = stereo.photo_consistency(small[0], depths[0], level, list(zip(small[1:], depths[1:])), margin)
+    levels, margin = [-0.02, 0.05, 0.2], 0.03
+    filled = np.nan_to_num(depths[0], nan=1.0)
+    others = [(s.camera, s.normalized, d) for s, d in zip(small[1:], depths[1:])]
+    mine = stereo.sweep(small[0].camera, small[0].normalized, [filled + below for below in levels], others, margin)
     rng = np.random.default_rng(0)
     inner = np.argwhere(ndimage.binary_erosion(np.isfinite(depths[0]), iterations=4))
     for row, column in inner[rng.permutation(len(inner))[:25]]:
-        for k, below in enumerate(level):
-            scores = [
-                correlation(small[0], depths[0] + below, *pair, row, column, margin) for pair in zip(small[1:], depths[1:])
-            ]
+        for k, below in enumerate(levels):
+            scores = [likeness(small[0], filled + below, *other, row, column, margin) for other in others]
             assert mine[k, row, column] == pytest.approx(np.mean(sorted(scores)[-3:]), abs=2e-3)
 
 
-def correlation(here, depth, other, surface, row, column, margin):
-    """Of the 5 × 5 pixels around one of ``here``, at ``depth``, and what ``other`` shows there."""
+def likeness(here, depth, camera, image, surface, row, column, margin):
+    """Of the 5 × 5 pixels around one of ``here``, at ``depth``, and what another view shows there."""
     rows, columns = np.mgrid[row - 2 : row + 3, column - 2 : column + 3]
     points = here.camera.origin + here.camera.rays()[rows, columns].reshape(-1, 3) * depth[rows, columns].reshape(-1, 1)
-    pixel, z = other.camera.project(points)
+    pixel, z = camera.project(points)
     pixel = pixel - 0.5
     at = np.floor(pixel).astype(int)
-    inside = (pixel >= 0).all(1) & (pixel < np.array(other.camera.size) - 1).all(1)
+    inside = (pixel >= 0).all(1) & (pixel < np.array(camera.size) - 1).all(1)
     there = np.where(np.isfinite(surface), surface, np.inf)[tuple(np.clip(at, 0, SIZE - 1).T[::-1])]
     allowed = inside & (z > there - margin)
     if not allowed[12]:
         return -1.0
-    seen = ndimage.map_coordinates(other.grey, pixel.T[::-1], order=1)
-    a, b = here.grey[rows, columns].ravel(), np.where(allowed, seen, 1)
-    cross = ((a - a.mean()) * (b - b.mean())).mean()
-    return cross / np.sqrt(max(a.var(), 1e-4) * max(b.var(), 1e-4))
+    seen = ndimage.map_coordinates(image, pixel.T[::-1], order=1)
+    return np.where(allowed, here.normalized[rows, columns].ravel() * seen, -1).mean()
+
+
+def depth_map(rng, camera):
+    depth = rng.uniform(1.5, 3, camera.size[::-1]).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.1] = np.nan
+    return stereo.DepthMap(
+        camera, depth, rng.uniform(0, 1, depth.shape).astype(np.float32), np.full(depth.shape, 0.3, np.float32)
+    )
+
+
+def test_agreement_is_what_loops_say():
+    rng = np.random.default_rng(3)
+    maps = [depth_map(rng, camera) for camera in above(2.2)[:6]]
+    points = rng.uniform(-0.6, 0.6, (40, 3)).astype(np.float32)
+    same, through = stereo.agreement(points, maps)
+    for k, point in enumerate(points):
+        expected = np.zeros(2)
+        for m in maps:
+            (pixel,), (z,) = m.camera.project(point[None])
+            column, row = np.floor(pixel).astype(int)
+            if not (0 <= column < SIZE and 0 <= row < SIZE) or np.isnan(m.depth[row, column]):
+                continue
+            farther, weight = m.depth[row, column] - z, m.likeness[row, column]
+            expected += [weight * (abs(farther) <= 0.3), weight * (farther > 0.3)]
+        assert [same[k], through[k]] == pytest.approx(expected, abs=1e-5)
+
+
+def test_seen_through_asks_for_most_and_for_several():
+    camera = above(2.2)[0]
+    far = lambda likeness: stereo.DepthMap(camera, *(np.full((SIZE, SIZE), v, np.float32) for v in (3.0, likeness, 0.1)))
+    near = stereo.DepthMap(camera, *(np.full((SIZE, SIZE), v, np.float32) for v in (2.2, 1.0, 0.1)))
+    center = np.zeros((1, 3))
+    assert not seen_through(center, [far(1.0)] * 2)[0]
+    assert seen_through(center, [far(1.0)] * 3)[0]
+    assert not seen_through(center, [far(0.5)] * 3)[0]
+    assert not seen_through(center, [far(1.0)] * 3 + [near] * 3)[0]
+
+
+def test_thinned_points_keep_their_distance_and_leave_no_gap():
+    rng = np.random.default_rng(0)
+    points, radius = rng.random((2000, 3)), rng.uniform(0.05, 0.15, 2000)
+    kept = thinned(points, radius)
+    distance = np.linalg.norm(points[:, None] - points[kept], axis=-1)
+    least = np.minimum(radius[:, None], radius[kept])
+    own = np.arange(len(points))[:, None] == kept
+    assert (distance < least)[kept][~own[kept]].sum() == 0
+    assert (distance < least).any(1).all()
+
+
+def test_smoothing_takes_noise_out_and_leaves_an_edge():
+    rng = np.random.default_rng(0)
+    flat = np.c_[rng.random((3000, 2)), 0.003 * rng.normal(size=3000)].astype(np.float32)
+    normals = np.float32([0, 0, 1]) + 0.2 * rng.normal(size=(3000, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    side = np.float32([[0, 0, 1], [0, 1, 0], [-1, 0, 0]])  # a quarter turn about y
+    points, turned = smoothed(np.r_[flat, flat @ side.T], np.r_[normals, normals @ side.T])
+    assert abs(points[:3000, 2]).mean() < 0.5 * abs(flat[:, 2]).mean()
+    inner = flat[:, 0] > 0.1
+    assert np.degrees(np.arccos(turned[:3000][inner, 2])).mean() < 5
