@@ -52,7 +52,11 @@ def photographs(folder: Path, target: Path, longest: int, done: Callable[[float]
         kinds = sorted({_OTHERS[s] for path in folder.iterdir() if (s := path.suffix.lower()) in _OTHERS})
         raise UserError(
             f"{folder} holds no photographs (JPEG or PNG): "
-            + (f"convert its {' and '.join(kinds)} files to JPEG" if kinds else "give the folder that they are in, or a video")
+            + (
+                f"convert its {' and '.join(kinds)} files to JPEG"
+                if kinds
+                else "give the folder that they are in, or a video"
+            )
         )
     names: dict[str, Path] = {}
     for path in paths:
@@ -178,7 +182,9 @@ def _decoder(video: Path, longest: int) -> tuple[int, float, Iterator[np.ndarray
     scale = f"scale='if(gt(iw,ih),min(iw,{longest}),-2)':'if(gt(iw,ih),-2,min(ih,{longest}))'"
     try:
         total, _ = imageio_ffmpeg.count_frames_and_secs(str(video))
-        reader = imageio_ffmpeg.read_frames(str(video), pix_fmt="rgb24", output_params=["-vf", scale, "-fps_mode", "passthrough"])
+        reader = imageio_ffmpeg.read_frames(
+            str(video), pix_fmt="rgb24", output_params=["-vf", scale, "-fps_mode", "passthrough"]
+        )
         meta = next(reader)
         width, height = meta["size"]
         rate = float(meta["fps"]) or 30.0

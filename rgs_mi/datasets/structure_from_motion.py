@@ -18,7 +18,9 @@ from ..core.camera import Camera
 from ..core.errors import UserError
 from .colmap_files import Image, read_model
 
-REMEDY = "walk around the object, with two thirds of a picture in common from one to the next, and leave the textured room in it"
+REMEDY = (
+    "walk around the object, with two thirds of a picture in common from one to the next, and leave the textured room in it"
+)
 _SIDE, _FEATURES = 1200, 3000  # pixels of the longer side, and features of a photograph
 _EXHAUSTIVE = 150  # photographs up to which all pairs are matched: 11 000 pairs
 _NEIGHBOURS, _LEAPS = 12, (16, 24, 32, 48, 64, 96)  # of more, in their order: the next ones, and some farther on
@@ -211,7 +213,8 @@ def _checked(model, folder, names, reasons) -> Structure:
         raise UserError(f"photographs have only {len(kept)} points in common, too few to rely on: {REMEDY}")
     if not (angle := _angle(images, points)) >= _LEAST_ANGLE:  # True for NaN
         raise UserError(
-            f"cameras stand nearly in one place ({angle:.1f} degrees apart, as seen from the object): do not turn on the spot, {REMEDY}"
+            f"cameras stand nearly in one place ({angle:.1f} degrees apart, as seen from the object): do not turn on the spot, "
+            f"{REMEDY}"
         )
     errors, observations = _quality(model)
     placed = {image.name for image in images}
