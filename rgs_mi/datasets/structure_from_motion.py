@@ -19,7 +19,8 @@ from ..core.errors import UserError
 from .colmap_files import Image, read_model
 
 REMEDY = (
-    "walk around the object, with two thirds of a picture in common from one to the next, and leave the textured room in it"
+    "walk around the object, never turning on the spot, with two thirds of a picture in common from one to the next, and the "
+    "textured room in it"
 )
 _SIDE, _FEATURES = 1200, 3000  # pixels of the longer side, and features of a photograph
 _EXHAUSTIVE = 150  # photographs up to which all pairs are matched: 11 000 pairs
@@ -187,7 +188,11 @@ def _with_centre(model, threads):
     refined = pycolmap.Reconstruction(model)
     options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
     options.ceres.solver_options.num_threads = threads
-    pycolmap.bundle_adjustment(refined, options)
+    config = pycolmap.BundleAdjustmentConfig()
+    for number in refined.reg_image_ids():
+        config.add_image(number)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_bundle_adjuster(options, config, refined).solve()
     refined.update_point_3d_errors()
     for camera in refined.cameras.values():
         centre = camera.width / 2, camera.height / 2
@@ -212,10 +217,7 @@ def _checked(model, folder, names, reasons) -> Structure:
     if len(kept) < _LEAST_POINTS:
         raise UserError(f"photographs have only {len(kept)} points in common, too few to rely on: {REMEDY}")
     if not (angle := _angle(images, points)) >= _LEAST_ANGLE:  # True for NaN
-        raise UserError(
-            f"cameras stand nearly in one place ({angle:.1f} degrees apart, as seen from the object): do not turn on the spot, "
-            f"{REMEDY}"
-        )
+        raise UserError(f"cameras stand nearly in one place ({angle:.1f} degrees apart, as seen from the object): {REMEDY}")
     errors, observations = _quality(model)
     placed = {image.name for image in images}
     return Structure(
@@ -279,7 +281,7 @@ def _unplaced(reasons, names) -> str:
         return f"photographs have too little texture ({features:.0f} features in the median): put the object on a textured ground"
     if matches < _LEAST_INLIERS:
         return f"photographs have nothing in common with each other: {REMEDY}"
-    return f"photographs match, and yet show no depth: do not turn on the spot, {REMEDY}"
+    return f"photographs match, and yet show no depth: {REMEDY}"
 
 
 def _query(database, statement):

@@ -73,7 +73,7 @@ def _around(cameras):
     if width > _GAP:
         yield (
             f"{width:.0f} degrees of the way around have no photograph, between {before} and {after}: what is seen only from "
-            "there is guessed. Go on around the object."
+            "there is guessed. Go on around the object, if you can."
         )
 
 

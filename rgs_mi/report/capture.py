@@ -40,6 +40,8 @@ def write(
     """
     lines = advice(cameras, sources, structure.errors, silhouettes)
     errors = np.array([structure.errors[name] for name in cameras])
+    start, width, _, _ = largest_gap(cameras)
+    gap = (start, width) if width > _GAP else None
     dull = {source.name for source in blurred(sources)}
     page = html.render(
         "capture.html",
@@ -50,7 +52,8 @@ def write(
         advice=lines,
         error=float(np.nanmedian(errors)),
         points=len(points),
-        places=_places(cameras, points),
+        places=_places(cameras, points, gap),
+        gap=gap,
         plots=[
             plots.bars(errors, errors > 1.8 * np.nanmedian(errors), "photograph", "mean reprojection error, pixels"),
             plots.bars(
@@ -83,11 +86,10 @@ def write(
     return lines
 
 
-def _places(cameras, points) -> list[str]:
-    start, width, _, _ = largest_gap(cameras)
+def _places(cameras, points, gap) -> list[str]:
     origins = np.stack([camera.origin for camera in cameras.values()])
     axes = np.stack([camera.to_world[:3, 2] for camera in cameras.values()])
-    return plots.cameras(origins, axes, points[:: -(-len(points) // _CLOUD)], (start, width) if width > _GAP else None)
+    return plots.cameras(origins, axes, points[:: -(-len(points) // _CLOUD)], gap)
 
 
 def _lenses(structure) -> list[dict]:

@@ -132,14 +132,14 @@ def cameras(origins: np.ndarray, axes: np.ndarray, points: np.ndarray, gap: tupl
     near = points[(np.abs(points) < reach).all(1)]
     around = np.hypot(origins[:, 0], origins[:, 1])
     across = np.einsum("ij,ij->i", axes[:, :2], origins[:, :2]) / np.maximum(around, 1e-9)
-    above = lambda: _places(origins[:, :2], axes[:, :2], near[:, :2], gap, reach, "from above: x and y")
+    above = lambda: _places(origins[:, :2], axes[:, :2], near[:, :2], gap, reach, "from above: x and y", True)
     side = np.stack([around, origins[:, 2]], 1), np.stack([across, axes[:, 2]], 1)
     cloud = np.stack([np.hypot(near[:, 0], near[:, 1]), near[:, 2]], 1)
-    beside = lambda: _places(*side, cloud, None, reach, "from the side: distance from the vertical, and z")
+    beside = lambda: _places(*side, cloud, None, reach, "from the side: distance from the vertical, and z", False)
     return [_svg(above, "cameras from above"), _svg(beside, "cameras from the side")]
 
 
-def _places(origins, axes, points, gap, reach, title):
+def _places(origins, axes, points, gap, reach, title, numbered):
     from matplotlib.figure import Figure
     from matplotlib.patches import Wedge
 
@@ -151,7 +151,7 @@ def _places(origins, axes, points, gap, reach, title):
     plot.plot(*origins.T, color=_LINE, linewidth=0.8, zorder=1)
     plot.quiver(*origins.T, *axes.T, color=_INKS[0], angles="xy", scale_units="xy", scale=7 / reach, width=0.004, zorder=2)
     plot.scatter(*origins.T, s=12, color=_INKS[0], zorder=3)
-    for k in range(0, len(origins), max(len(origins) // 12, 1)):
+    for k in range(0, len(origins) if numbered else 0, max(len(origins) // 12, 1)):
         plot.annotate(str(k + 1), origins[k], (4, 4), textcoords="offset points")
     plot.plot(0, 0, "+", color=_BOUND, markersize=9)
     plot.set_aspect("equal")
