@@ -190,7 +190,7 @@ def _decoder(video: Path, longest: int) -> tuple[int, float, Iterator[np.ndarray
         rate = float(meta["fps"]) or 30.0
     except (OSError, RuntimeError, KeyError, ValueError, StopIteration) as error:
         raise UserError(f"{video} cannot be decoded as a video: export it as MP4 (H.264), or give photographs") from error
-    if total < 1:
+    if not total:
         raise UserError(f"{video} holds no frames: export it as MP4 (H.264), or give photographs")
 
     def decoded():

@@ -13,7 +13,7 @@ from .figures import number
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_SIZE = 6.6, 3.5  # inches of 72 pixels
+_SIZE, _SIDE = (6.6, 3.5), 4.7  # inches of 72 pixels
 _INKS = "#1f5fa8", "#c4572b", "#35803f", "#7a4ea3", "#97791a", "#666c73"
 _SOFT, _LINE, _BOUND = "#626a73", "#d9dde2", "#b33333"
 _STYLE: dict[Any, Any] = {
@@ -143,7 +143,7 @@ def _places(origins, axes, points, gap, reach, title, numbered):
     from matplotlib.figure import Figure
     from matplotlib.patches import Wedge
 
-    figure = Figure((_SIZE[1] * 1.35,) * 2, layout="constrained")
+    figure = Figure((_SIDE, _SIDE), layout="constrained")
     plot = figure.add_subplot()
     if gap:
         plot.add_patch(Wedge((0, 0), reach, gap[0], sum(gap), color=_BOUND, alpha=0.12, linewidth=0))
