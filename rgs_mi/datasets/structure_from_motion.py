@@ -27,7 +27,8 @@ _EXHAUSTIVE = 150  # photographs up to which all pairs are matched: 11 000 pairs
 _NEIGHBOURS, _LEAPS = 12, (16, 24, 32, 48, 64, 96)  # of more, in their order: the next ones, and some farther on
 _BLOCK = 20  # photographs a side of what is matched at once: their features are indexed once
 _LEAST_FEATURES, _LEAST_INLIERS = 50, 15  # of a photograph; of a pair
-_LEAST_VIEWS, _LEAST_POINTS, _LEAST_ANGLE = 3, 60, 1.5  # of a model; degrees from camera to camera, at the points' median
+# of a model; degrees from camera to camera at the points' median, which a lens makes up where cameras only turn
+_LEAST_VIEWS, _LEAST_POINTS, _LEAST_ANGLE = 3, 60, 6.0
 _TRUE_TRACK, _TRUE_ERROR = 3, 2.0  # points are kept that so many photographs show, pixels off at most
 _CENTRE_VIEWS, _CENTRE_SHIFT = 10, 0.08  # the principal point is estimated from so many; a larger shift is no lens's
 

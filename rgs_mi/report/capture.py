@@ -40,6 +40,7 @@ def write(
     """
     lines = advice(cameras, sources, structure.errors, silhouettes)
     errors = np.array([structure.errors[name] for name in cameras])
+    odd = (errors > 1.8 * np.nanmedian(errors)).tolist()
     start, width, _, _ = largest_gap(cameras)
     gap = (start, width) if width > _GAP else None
     dull = {source.name for source in blurred(sources)}
