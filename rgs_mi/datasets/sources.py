@@ -1,8 +1,9 @@
 """What a capture begins with, a folder of photographs or a video, as files that every layout's reader takes: upright PNGs and
-JPEGs of bounded size, whose names have no spaces.
+JPEGs of bounded size, whose names are letters, digits, dots and dashes.
 """
 
 import logging
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,9 +48,10 @@ def photographs(folder: Path, target: Path, longest: int, done: Callable[[float]
     The focal length stays in the EXIF of what is encoded again; places and times do not.
     Raises: UserError for a folder without photographs, for two of one name, and for files that can't be read.
     """
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in PHOTOGRAPHS and path.is_file())
+    shown = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    paths = [path for path in shown if path.suffix.lower() in PHOTOGRAPHS and path.is_file()]
     if not paths:
-        kinds = sorted({_OTHERS[s] for path in folder.iterdir() if (s := path.suffix.lower()) in _OTHERS})
+        kinds = sorted({_OTHERS[s] for path in shown if (s := path.suffix.lower()) in _OTHERS})
         raise UserError(
             f"{folder} holds no photographs (JPEG or PNG): "
             + (
@@ -60,7 +62,7 @@ def photographs(folder: Path, target: Path, longest: int, done: Callable[[float]
         )
     names: dict[str, Path] = {}
     for path in paths:
-        stem = "_".join(path.stem.split())
+        stem = re.sub(r"[^\w.-]+", "_", path.stem)
         if (first := names.setdefault(stem, path)) is not path:
             raise UserError(f"{path} and {first.name} would have the same name in the capture: rename one of them")
     sources = []

@@ -227,7 +227,7 @@ def _checked(model, folder, names, reasons) -> Structure:
         observations,
         points,
         np.array([p.color for p in kept], np.uint8),
-        {name: _why(*reasons[name]) for name in names if name not in placed},
+        {name: _why(*reasons.get(name, (0, 0))) for name in names if name not in placed},
     )
 
 
@@ -276,8 +276,8 @@ def _why(features: int, matches: int) -> str:
 
 
 def _unplaced(reasons, names) -> str:
-    features = float(np.median([reasons[name][0] for name in names]))
-    matches = float(np.median([reasons[name][1] for name in names]))
+    features = float(np.median([reasons.get(name, (0, 0))[0] for name in names]))
+    matches = float(np.median([reasons.get(name, (0, 0))[1] for name in names]))
     if features < _LEAST_FEATURES:
         return f"photographs have too little texture ({features:.0f} features in the median): put the object on a textured ground"
     if matches < _LEAST_INLIERS:

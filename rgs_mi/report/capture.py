@@ -56,12 +56,7 @@ def write(
         places=_places(cameras, points, gap),
         gap=gap,
         plots=[
-            plots.bars(
-                errors.tolist(),
-                (errors > 1.8 * np.nanmedian(errors)).tolist(),
-                "photograph",
-                "mean reprojection error, pixels",
-            ),
+            plots.bars(errors.tolist(), odd, "photograph", "mean reprojection error, pixels"),
             plots.bars(
                 [structure.observations[name] for name in cameras],
                 [structure.observations[name] < 100 for name in cameras],

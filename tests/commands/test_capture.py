@@ -144,6 +144,7 @@ def test_photographs_are_upright_small_and_named_without_spaces(tmp_path):
     save(tmp_path / "in/c.PNG", (20, 16))
     save(tmp_path / "in/large.jpeg", (90, 60))
     (tmp_path / "in/notes.txt").write_text("no photograph")
+    (tmp_path / "in/._c.png").write_bytes(b"what some systems leave beside files")
     (tmp_path / "out").mkdir()
     fractions = []
     found = sources.photographs(tmp_path / "in", tmp_path / "out", 60, fractions.append)
