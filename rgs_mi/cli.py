@@ -6,10 +6,11 @@ import sys
 
 from .core.errors import run_main
 from .core.runtime import CACHE_VARIABLE, cache_folder
-from .verbs import fits, renderings, suites
+from .verbs import captures, fits, renderings, suites
 from .verbs.arguments import Parser
 
 VERBS = {
+    "capture": captures.capture,
     "optimize": fits.optimize,
     "evaluate": fits.evaluate,
     "recovery": fits.recovery,

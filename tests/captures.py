@@ -194,6 +194,21 @@ def write_colmap(
     return root
 
 
+def write_llff(root, images, folder="images", scale=1.0, suffix=".png", bounds=(2.0, 6.0)):
+    """Whose images in ``folder`` may be smaller than the ``scale`` times larger ones that it counts pixels of; the optical
+    axis is the centre, as the layout has it."""
+    rows = [
+        np.append(
+            np.c_[pose[:3, 1], pose[:3, 0], -pose[:3, 2], pose[:3, 3], scale * np.array([*SIZE[::-1], FOCAL[0]])], bounds
+        )
+        for pose in poses(len(images))
+    ]
+    np.save(root / "poses_bounds.npy", rows)
+    for name, pixels in images.items():
+        save(root / folder / f"{name}{suffix}", pixels)
+    return root
+
+
 def write_nero(root, images, depths=None, protocol=4):
     """``depths``: [H, W] in units, one for all, or one each."""
     matrix = np.array([[FOCAL[0], 0, PRINCIPAL[0]], [0, FOCAL[1], PRINCIPAL[1]], [0, 0, 1]])

@@ -38,6 +38,7 @@ from captures import (
     write_cloud,
     write_colmap,
     write_exr,
+    write_llff,
     write_nerfstudio,
     write_nero,
     write_png16,
@@ -87,6 +88,10 @@ def write_all(root: Path) -> list:
     nero = write_nero(folder("nero"), images, np.where(mask, 4.0, 15.0))
     nero_text = write_nero(folder("protocol0"), images, protocol=0)
 
+    llff = write_llff(folder("llff"), images, scale=1 / 4)
+    for name in images:
+        save(llff / f"masks/{name}.png", mask)
+
     rng = np.random.default_rng(0)
     surfels = {
         "centers": rng.normal(size=(5, 3)),
@@ -117,7 +122,7 @@ def write_all(root: Path) -> list:
     inside = lambda path: sorted(file for file in path.rglob("*") if file.is_file())
     targets = [
         (lambda path=path: check_dataset(load_dataset(path)), inside(path))
-        for path in (blender, studio, binary, text, nero, nero_text)
+        for path in (blender, studio, binary, text, nero, nero_text, llff)
     ]
     return targets + [
         (lambda: check_finite(read_ply(root / "surfels.ply").values()), [root / "surfels.ply"]),

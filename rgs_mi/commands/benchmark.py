@@ -148,7 +148,7 @@ def step(
             *overrides,
         ],
     )
-    fit: Fit = start(scene, scene.dataset(), settings)
+    fit: Fit = start(scene, scene.dataset(settings.resolution), settings)
     for _ in range(len(fit.dataset.train)):  # loads each photograph once
         fit.step()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

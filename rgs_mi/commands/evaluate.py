@@ -54,8 +54,9 @@ def reevaluate(run: str | Path, data: str | Path | None = None, quiet: bool = Fa
     saved, curves, path = _saved(run / results.METRICS), Curves.read(run), run / SCENE
     scene = load_scene(path, {})
     surfels, lighting = lit_surfels(scene, path)
-    dataset = _photographs(data or saved.get("photographs"), scene, run)
-    mean, scores, rows = results.measure(surfels, lighting, dataset, _background(saved, run), spp_of(scene), run, quiet)
+    background, longest = _setting(saved, "background", (0, 1), run), _setting(saved, "resolution", (1, 1 << 16), run)
+    dataset = _photographs(data or saved.get("photographs"), scene, run, int(longest), quiet)
+    mean, scores, rows = results.measure(surfels, lighting, dataset, background, spp_of(scene), run, quiet)
     if not lpips.installed():
         _keep_lpips(saved, mean, scores)
     now = {"photographs": str(dataset.root.resolve()), "evaluated": results.circumstances()}
@@ -86,21 +87,24 @@ def _keep_lpips(saved, mean, scores):
             figures |= {name: saved["views"].get(view, {}).get(name) for name in names}
 
 
-def _background(saved, run):
+def _setting(saved, name, limits, run) -> float:
+    """The number ``name`` of the settings that were ``saved``."""
     try:
-        background = float(saved["settings"]["background"])
+        value = float(saved["settings"][name])
     except (KeyError, TypeError, ValueError):
-        background = np.nan
-    if not 0 <= background <= 1:
-        raise UserError(f"{run / results.METRICS}: its settings have no background from 0 to 1: it is damaged")
-    return background
+        value = np.nan
+    if not limits[0] <= value <= limits[1]:
+        raise UserError(
+            f"{run / results.METRICS}: its settings have no {name} from {limits[0]} to {limits[1]}: it is damaged"
+        )
+    return value
 
 
-def _photographs(folder, scene, run):
+def _photographs(folder, scene, run, longest, quiet):
     """The `Dataset`. Raises: UserError where its views are not those of the scene's sensors."""
     if not isinstance(folder, str | Path):
         raise UserError(f"{run / results.METRICS} does not say where the photographs are: give their folder with --data")
-    dataset = load_dataset(folder)
+    dataset = load_dataset(folder, longest, quiet)
     views, sensors = results.evaluation_views(dataset), scene.sensors()
     same = [sensor_id(view.name) for view in views] == [sensor.id() for sensor in sensors]
     if not same or not all(map(_sees_the_same, views, sensors)):

@@ -86,13 +86,13 @@ def effort(settings: dict) -> str:
 # ---- Doing it ----
 
 
-def photographs(xml: str | Path, data: str | Path, quiet: bool) -> tuple[str, list[View]]:
-    """Return a digest of all photographs of a scene, which are path-traced first where need be, and a few of its preview
-    views.
+def photographs(xml: str | Path, data: str | Path, longest: int, quiet: bool) -> tuple[str, list[View]]:
+    """Return a digest of all photographs of a scene, which are path-traced first where need be, and scaled where they have
+    more than ``longest`` pixels along a side, and a few of its preview views.
 
     Raises: UserError for photographs that can't be read.
     """
-    dataset = FitScene.load(xml, data).dataset(quiet)
+    dataset = FitScene.load(xml, data).dataset(longest, quiet)
     digest = hashlib.sha256()
     for view in [*dataset.train, *dataset.test]:
         for part in (view.name.encode(), view.camera.to_world.tobytes(), view.pixels.tobytes()):

@@ -63,7 +63,7 @@ def optimize(
     folder = Path(out) if out else Path("runs") / scene.name
     saved = _saved(folder, resume)
     events = Events(folder / "tensorboard", saved[1]["step"] if saved else 0) if tensorboard else None
-    dataset = scene.dataset(quiet)
+    dataset = scene.dataset(settings.resolution, quiet)
     make_folder(folder)
     fit = _resume(saved, scene, dataset, settings) if saved else start(scene, dataset, settings, quiet)
     try:

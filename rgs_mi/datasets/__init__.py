@@ -1,19 +1,22 @@
 """Photographs and their cameras: a folder in, lists of `View` out."""
 
+import sys
 from pathlib import Path
 
 from ..core.errors import UserError
-from . import blender, colmap, nerfstudio, nero
+from . import blender, colmap, llff, nerfstudio, nero
+from .resolution import LONGEST
 from .types import Dataset
 
-_LAYOUTS = blender, nerfstudio, colmap, nero  # the first that fits is the one
+_LAYOUTS = blender, nerfstudio, colmap, llff, nero  # the first that fits is the one
 
 
-def load_dataset(root: str | Path) -> Dataset:
-    """Load the capture in folder ``root``, in the first layout that it has: `blender`, `nerfstudio`, `colmap`, `nero`.
+def load_dataset(root: str | Path, longest: int = LONGEST, quiet: bool = True) -> Dataset:
+    """Load the capture in folder ``root``, in the first layout that it has: `blender`, `nerfstudio`, `colmap`, `llff`, `nero`.
 
     World and cameras stay as in the files. Photographs of lenses with distortion are made those of pinholes
-    (`distortion.undistorted`, which keeps them).
+    (`distortion.undistorted`, which keeps them). Those of more than ``longest`` pixels along a side are scaled to it, with
+    masks and cameras; unless ``quiet``, a line on stderr says how many.
     Raises: UserError when the folder is missing, has no known layout, or when a file in it is bad.
     """
     root = Path(root)
@@ -21,8 +24,22 @@ def load_dataset(root: str | Path) -> Dataset:
         raise UserError(f"data folder '{root}' does not exist: give a capture's folder with --data")
     for layout in _LAYOUTS:
         if layout.found(root):
-            return layout.load(root)
+            dataset = layout.load(root, longest)
+            if not quiet:
+                _tell_scaled(dataset, longest)
+            return dataset
     raise UserError(f"data folder '{root}' has no layout that is known: looked for {looked_for()}")
+
+
+def _tell_scaled(dataset, longest):
+    views = [*dataset.train, *dataset.test]
+    if scaled := [view.scaled_from for view in views if view.scaled_from]:
+        width, height = scaled[0]
+        print(
+            f"{dataset.root}: {len(scaled)} of {len(views)} photographs are scaled to {longest} pixels along their longer side "
+            f"(the first from {width} x {height})",
+            file=sys.stderr,
+        )
 
 
 def is_capture(root: Path) -> bool:

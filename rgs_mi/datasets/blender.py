@@ -15,6 +15,7 @@ from ..core.errors import UserError
 from .frames import Frame, load_views
 from .images import read_grey
 from .points import sparse_points
+from .resolution import LONGEST
 from .transforms import frame_of, image_stem, read_json
 from .types import Dataset
 
@@ -27,8 +28,9 @@ def found(root: Path) -> bool:
     return (root / TRAIN).is_file()
 
 
-def load(root: Path) -> Dataset:
-    """Load a capture; without ``transforms_test.json`` nothing is held out.
+def load(root: Path, longest: int = LONGEST) -> Dataset:
+    """Load a capture, photographs of more than ``longest`` pixels along a side scaled; without ``transforms_test.json``
+    nothing is held out.
 
     Frames without an image file and views with an empty mask are left out, each kind with one warning per split.
     Raises: UserError for anything in the folder that cannot be used, naming the file and the frame.
@@ -37,9 +39,9 @@ def load(root: Path) -> Dataset:
     if not root.is_dir():
         raise UserError(f"data folder '{root}' does not exist: give a capture's folder with --data")
     points, colors = sparse_points(root) or (None, None)
-    splits = {"train": load_views(root / TRAIN, _frames(root / TRAIN, ())), "test": []}
+    splits = {"train": load_views(root / TRAIN, _frames(root / TRAIN, ()), longest), "test": []}
     if (root / TEST).is_file():
-        splits["test"] = load_views(root / TEST, _frames(root / TEST, ("_normal.png", "_normal_0001.png")))
+        splits["test"] = load_views(root / TEST, _frames(root / TEST, ("_normal.png", "_normal_0001.png")), longest)
     return Dataset(**splits, points=points, point_colors=colors, root=root)
 
 

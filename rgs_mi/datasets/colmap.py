@@ -18,7 +18,7 @@ from .colmap_files import Image, read_model
 from .frames import Frame, every_eighth, load_split, pinhole, rigid
 from .images import read_grey
 from .points import sparse_points
-from .resolution import chosen
+from .resolution import LONGEST, chosen
 from .transforms import find_image, image_stem
 from .types import Dataset
 
@@ -32,15 +32,16 @@ def found(root: Path) -> bool:
     return _model(root) is not None
 
 
-def load(root: Path) -> Dataset:
-    """Load a capture. Photographs that are not there and views with an empty mask are left out, each kind with one
-    warning. Raises: UserError for anything in the folder that cannot be used, naming the file."""
+def load(root: Path, longest: int = LONGEST) -> Dataset:
+    """Load a capture, photographs of more than ``longest`` pixels along a side scaled. Photographs that are not there and
+    views with an empty mask are left out, each kind with one warning. Raises: UserError for anything in the folder that
+    cannot be used, naming the file."""
     files = _model(root)
     assert files is not None, "found() says that they are there"
     model, suffix = files
     images = read_model(root / model, suffix)
     source = root / model / f"images{suffix}"
-    folder = chosen(root / "images", max(max(image.lens.size) for image in images))
+    folder = chosen(root / "images", max(max(image.lens.size) for image in images), longest)
     if not folder.is_dir():
         raise UserError(f"{root}: there is no folder 'images' for the photographs that {source} names: add it")
     paths = _paths([image.name for image in images], root / "images", folder)
@@ -51,7 +52,7 @@ def load(root: Path) -> Dataset:
         )
     points, colors = sparse_points(root, [f"{model}/points3D{e}" for e in (".bin", ".txt", ".ply")]) or (None, None)
     return Dataset(
-        **load_split(source, frames, every_eighth(sorted(frame.name for frame in frames))),
+        **load_split(source, frames, every_eighth(sorted(frame.name for frame in frames)), longest),
         points=points,
         point_colors=colors,
         root=root,

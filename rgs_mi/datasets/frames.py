@@ -4,20 +4,23 @@ import warnings
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from threading import BoundedSemaphore
 
 import numpy as np
 
 from ..core.camera import Camera
 from ..core.errors import UserError
 from .distortion import Distortion, cropped_to_valid, undistorted
-from .images import check_proportions, read_image, read_normal, with_mask
+from .images import check_proportions, image_size, limited, read_image, read_normal, with_mask
 from .points import FARTHEST
 from .types import View
 
 HOLD_OUT = 8  # as LLFF, Mip-NeRF 360 and 3DGS have it
 FOCAL_LIMITS = (1e-3, 1e8)  # pixels
 SIZE_LIMITS = (0, 1e6)  # pixels; the principal point lies between -1e6 and 1e6
+_AT_ONCE = BoundedSemaphore(3)  # photographs that are held at their full size, however many threads there are
 
 
 @dataclass(frozen=True)
@@ -45,9 +48,9 @@ class Frame:
     missing: bool = False
 
 
-def load_views(source: Path, frames: list[Frame]) -> list[View]:
-    """Load the usable views of ``frames``, which ``source`` names. Frames without an image file and views with an empty mask
-    are left out, each kind with one warning.
+def load_views(source: Path, frames: list[Frame], longest: int) -> list[View]:
+    """Load the usable views of ``frames``, which ``source`` names, scaled where they have more than ``longest`` pixels along a
+    side. Frames without an image file and views with an empty mask are left out, each kind with one warning.
 
     Raises: UserError for a bad image, mask or camera, for two frames of one name, and where no view is left.
     """
@@ -70,7 +73,7 @@ def load_views(source: Path, frames: list[Frame]) -> list[View]:
             stacklevel=4,
         )
     with ThreadPoolExecutor() as pool:
-        views = list(pool.map(_load_view, found))
+        views = list(pool.map(partial(_load_view, longest=longest), found))
     kept = [view for view in views if view.pixels[..., 3].any()]
     if not kept:
         raise UserError(f"{source}: the alpha channel of every image is zero: export with a mask, or as RGB")
@@ -82,12 +85,12 @@ def load_views(source: Path, frames: list[Frame]) -> list[View]:
     return kept
 
 
-def load_split(source: Path, frames: list[Frame], held_out: set[str]) -> dict[str, list[View]]:
-    """Load views as the lists ``train`` and ``test`` of `Dataset`; ``held_out`` are the names of test views.
+def load_split(source: Path, frames: list[Frame], held_out: set[str], longest: int) -> dict[str, list[View]]:
+    """Load views (`load_views`) as the lists ``train`` and ``test`` of `Dataset`; ``held_out`` are the names of test views.
 
     Raises: UserError where no view is left to train with.
     """
-    views = load_views(source, frames)
+    views = load_views(source, frames, longest)
     train = [view for view in views if view.name not in held_out]
     if not train:
         raise UserError(f"{source}: all {len(views)} usable views are held out as test views: add photographs")
@@ -149,15 +152,18 @@ def pinhole(
     return Camera(to_world, floats(focal), floats(principal), (size[0], size[1])).resized(*photograph)
 
 
-def _load_view(frame: Frame) -> View:
-    pixels, masked = read_image(frame.path, frame.where)
-    if frame.mask and not masked:
-        pixels, masked = with_mask(pixels, frame.mask(), frame.where)
+def _load_view(frame: Frame, longest: int) -> View:
     assert frame.camera is not None, "its image is there"
-    camera = frame.camera((pixels.shape[1], pixels.shape[0]))
+    size = image_size(frame.path, frame.where)
+    scaled = limited(size, longest)
+    with _AT_ONCE:
+        pixels, masked = read_image(frame.path, frame.where, scaled)
+        if frame.mask and not masked:
+            pixels, masked = with_mask(pixels, frame.mask(), frame.where)
+        normal = read_normal(frame.normal, size, pixels, frame.where) if frame.normal and not frame.distortion else None
+    camera = frame.camera(size).resized(*scaled)
     if frame.distortion:
         pixels = undistorted(pixels, camera, frame.distortion, frame.name)
         if not masked:
             pixels, camera = cropped_to_valid(pixels, camera)
-    normal = read_normal(frame.normal, pixels, frame.where) if frame.normal and not frame.distortion else None
-    return View(frame.name, camera, pixels, masked, normal, frame.path)
+    return View(frame.name, camera, pixels, masked, normal, frame.path, size if scaled != size else None)

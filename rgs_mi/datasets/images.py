@@ -14,17 +14,30 @@ MAX_PIXELS = 1 << 26  # 8192 x 8192; a header that promises more is damaged or h
 _ASPECT = 0.05  # how far proportions may be off: small images round their sizes
 
 
-def read_image(path: Path, where: str) -> tuple[np.ndarray, bool]:
-    """Read a photograph as `View.pixels`, and whether it has a mask (an alpha channel that is not opaque everywhere).
+def read_image(path: Path, where: str, size: tuple[int, int] | None = None) -> tuple[np.ndarray, bool]:
+    """Read a photograph as `View.pixels`, and whether it has a mask (an alpha channel that is not opaque everywhere); scaled
+    to ``size`` (width, height) where that is given and another.
 
-    16-bit PNGs keep their high bytes. EXR files are linear with premultiplied alpha, as the format has it; ``where``
-    begins the message. Raises: UserError when the file is damaged, empty, too large, or holds NaN or infinity.
+    The means of scaling are weighted with alpha, and of display values where the file has those. 16-bit PNGs keep their high
+    bytes. EXR files are linear with premultiplied alpha, as the format has it; ``where`` begins the message.
+    Raises: UserError when the file is damaged, empty, too large, or holds NaN or infinity.
     """
-    pixels, alpha = _decoded(_read_exr if path.suffix.lower() == ".exr" else _read_ldr, path, where)
+    pixels, alpha = _decoded(_read_exr if _linear(path) else _read_ldr, path, where, size)
     if not alpha:
         pixels[..., 3] = 255 if pixels.dtype == np.uint8 else 1
     opaque = pixels[..., 3].min() >= (255 if pixels.dtype == np.uint8 else 1)
     return pixels, alpha and not bool(opaque)
+
+
+def image_size(path: Path, where: str) -> tuple[int, int]:
+    """Return the (width, height) that an image's header tells. Raises: UserError as `read_image` does."""
+    return _decoded(_size_of_exr if _linear(path) else _size_of_ldr, path, where)
+
+
+def limited(size: tuple[int, int], longest: int) -> tuple[int, int]:
+    """Return ``size`` (width, height) with the longer side ``longest`` where it is more, in the same proportions."""
+    scale = min(1.0, longest / max(size))
+    return max(round(scale * size[0]), 1), max(round(scale * size[1]), 1)
 
 
 def read_grey(path: Path, where: str) -> np.ndarray:
@@ -57,9 +70,13 @@ def check_proportions(size: tuple[float, float], photograph: tuple[int, int], wh
         )
 
 
-def _decoded(read, path, where):
+def _linear(path):
+    return path.suffix.lower() == ".exr"
+
+
+def _decoded(read, path, where, *options):
     try:
-        return read(path)
+        return read(path, *options)
     except Exception as error:  # decoders raise anything from OSError to SyntaxError on damaged files
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise UserError(f"{where}: {path} cannot be read as an image ({reason}): replace the file") from error
@@ -79,14 +96,24 @@ def _opened(path):
         yield image
 
 
-def _read_ldr(path: Path) -> tuple[np.ndarray, bool]:
-    """[H, W, 4] uint8 of a PNG or JPEG, and whether it has alpha."""
+def _size_of_ldr(path: Path) -> tuple[int, int]:
+    with _opened(path) as image:
+        return image.size
+
+
+def _read_ldr(path: Path, size: tuple[int, int] | None) -> tuple[np.ndarray, bool]:
+    """[H, W, 4] uint8 of a PNG or JPEG, scaled to ``size`` (width, height), and whether it has alpha."""
     from PIL import Image
 
     with _opened(path) as image:
+        if size:
+            image.draft(image.mode, size)  # a JPEG is decoded at a half, a quarter or an eighth where that is enough
         if image.mode.startswith("I"):  # 16-bit grey
             image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
         alpha = "A" in image.mode or "transparency" in image.info
+        image = image.convert("RGBA" if alpha else "RGB")
+        if size and size != image.size:
+            image = image.resize(size, Image.Resampling.HAMMING)
         return np.array(image.convert("RGBA")), alpha
 
 
@@ -102,13 +129,23 @@ def _read_grey(path: Path) -> np.ndarray:
         return np.asarray(image.convert("L"))
 
 
-def _read_exr(path: Path) -> tuple[np.ndarray, bool]:
-    """[H, W, 4] float32 of an OpenEXR file with straight alpha, and whether it has alpha."""
+def _size_of_exr(path: Path) -> tuple[int, int]:
     import OpenEXR
 
     with OpenEXR.File(str(path), header_only=True) as file:
         lower, upper = file.header()["dataWindow"]
-        check_size(int(upper[0]) - int(lower[0]) + 1, int(upper[1]) - int(lower[1]) + 1)
+        size = int(upper[0]) - int(lower[0]) + 1, int(upper[1]) - int(lower[1]) + 1
+    check_size(*size)
+    return size
+
+
+def _read_exr(path: Path, size: tuple[int, int] | None) -> tuple[np.ndarray, bool]:
+    """[H, W, 4] float32 of an OpenEXR file with straight alpha, scaled to ``size`` (width, height), and whether it has
+    alpha."""
+    import OpenEXR
+    from PIL import Image
+
+    whole = _size_of_exr(path)
     with OpenEXR.File(str(path), separate_channels=True) as file:
         channels = {name: channel.pixels for name, channel in file.channels().items()}
     if "Y" in channels:
@@ -120,6 +157,11 @@ def _read_exr(path: Path) -> tuple[np.ndarray, bool]:
     pixels = np.maximum(pixels.astype(np.float32), 0)
     if not np.isfinite(pixels).all():
         raise ValueError("NaN or infinite pixels")
+    if size and size != whole:  # its colours are premultiplied yet
+        planes = [
+            Image.fromarray(plane).resize(size, Image.Resampling.HAMMING) for plane in np.moveaxis(pixels, 2, 0).copy()
+        ]
+        pixels = np.stack([np.asarray(plane) for plane in planes], -1)
     a = pixels[..., 3:] = np.minimum(pixels[..., 3:], 1)
     pixels[..., :3] = np.where(a > 1e-4, pixels[..., :3] / np.maximum(a, 1e-4), 0)
     return pixels, alpha is not None
@@ -133,8 +175,10 @@ def check_size(width: int, height: int) -> None:
         raise ValueError(f"{width} x {height} pixels are too many")
 
 
-def read_normal(path: Path, pixels: np.ndarray, where: str) -> np.ndarray:
-    """Read the world-space unit normals [H, W, 3] float32 that belong to a photograph; 0 where unknown.
+def read_normal(path: Path, size: tuple[int, int], pixels: np.ndarray, where: str) -> np.ndarray:
+    """Read the world-space unit normals [H, W, 3] float32 that belong to a photograph whose file is of ``size`` (width,
+    height) and which is ``pixels`` [H, W, 4]; 0 where unknown. Those of a photograph that was scaled are sampled
+    (`resize`).
 
     ``_normal.png`` (Shiny Blender) holds n/2 + 1/2 and is known where neither its own alpha is zero nor it is black,
     which no unit normal is. ``_normal_0001.png`` (NeRF Synthetic) holds n itself, cut to [0, 1]
@@ -143,17 +187,21 @@ def read_normal(path: Path, pixels: np.ndarray, where: str) -> np.ndarray:
     """
     clamped = path.stem.endswith("_0001")
     image = read_image(path, where)[0]
-    if image.shape != pixels.shape:
+    if image.shape[1::-1] != size:
         raise UserError(
-            f"{where}: {path} is {image.shape[1]} x {image.shape[0]}, its photograph "
-            f"{pixels.shape[1]} x {pixels.shape[0]}: normals need the same size"
+            f"{where}: {path} is {image.shape[1]} x {image.shape[0]}, its photograph {size[0]} x {size[1]}: normals need the "
+            "same size"
         )
     black = ~image[..., :3].any(-1, keepdims=True)
     normal = image[..., :3].astype(np.float32) / np.float32(255)
     normal = srgb_decode(normal) if clamped else 2 * normal - 1
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
     known = (np.abs(length - 1) < 0.02) if clamped else (length > 0.1) & ~black & (image[..., 3:] > 0)
-    return np.where(known & (pixels[..., 3:] > 0), normal / np.maximum(length, 0.1), 0).astype(np.float32)
+    normal = np.where(known, normal / np.maximum(length, 0.1), np.float32(np.nan))
+    if image.shape[:2] != pixels.shape[:2]:
+        normal = np.stack([resize(normal[..., k], *pixels.shape[:2]) for k in range(3)], -1)
+        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 0.1)
+    return np.where(np.isfinite(normal) & (pixels[..., 3:] > 0), normal, 0).astype(np.float32)
 
 
 def resize(values: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -23,7 +23,7 @@ from ..core.errors import UserError
 from .frames import Frame, every_eighth, load_split
 from .images import read_grey
 from .points import FARTHEST, FILES, sparse_points
-from .resolution import chosen
+from .resolution import LONGEST, chosen
 from .transforms import frame_of, matrix, number, read_json
 from .types import Dataset
 
@@ -38,23 +38,24 @@ def found(root: Path) -> bool:
     return (root / FILE).is_file()
 
 
-def load(root: Path) -> Dataset:
-    """Load a capture. Frames without an image file and views with an empty mask are left out, each kind with one warning.
+def load(root: Path, longest: int = LONGEST) -> Dataset:
+    """Load a capture, photographs of more than ``longest`` pixels along a side scaled. Frames without an image file and views
+    with an empty mask are left out, each kind with one warning.
 
     Raises: UserError for anything in the folder that cannot be used, naming the file and the frame.
     """
     file = root / FILE
     meta = read_json(file)
-    frames = [_frame(file, meta, index) for index in range(len(meta["frames"]))]
+    frames = [_frame(file, meta, index, longest) for index in range(len(meta["frames"]))]
     kept, held_out = _split(file, meta, frames)
     points, colors = _points(file, meta) or (None, None)
-    return Dataset(**load_split(file, kept, held_out), points=points, point_colors=colors, root=root)
+    return Dataset(**load_split(file, kept, held_out, longest), points=points, point_colors=colors, root=root)
 
 
-def _frame(file: Path, meta: dict, index: int) -> Frame:
+def _frame(file: Path, meta: dict, index: int, longest: int) -> Frame:
     where, entry = f"{file}: frame {index}", meta["frames"][index]
     size = [number(meta, entry, key, 0, (0, 1e6), "pixels", where) for key in ("w", "h")]
-    frame = frame_of(file, meta, index, smaller=lambda path: chosen(path.parent, max(size)) / path.name)
+    frame = frame_of(file, meta, index, smaller=lambda path: chosen(path.parent, max(size), longest) / path.name)
     mask = entry.get("mask_path")
     if mask is None:
         return frame

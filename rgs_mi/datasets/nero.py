@@ -19,6 +19,7 @@ from ..core.errors import UserError
 from .frames import Frame, every_eighth, load_split, pinhole, rigid
 from .images import read_grey
 from .points import sparse_points
+from .resolution import LONGEST
 from .transforms import find_image
 from .types import Dataset
 
@@ -33,8 +34,9 @@ def found(root: Path) -> bool:
     return any(root.glob(f"?*{CAMERA}"))
 
 
-def load(root: Path) -> Dataset:
-    """Load a capture. Frames without an image file and views with an empty mask are left out, each kind with one warning.
+def load(root: Path, longest: int = LONGEST) -> Dataset:
+    """Load a capture, photographs of more than ``longest`` pixels along a side scaled. Frames without an image file and views
+    with an empty mask are left out, each kind with one warning.
 
     Raises: UserError for anything in the folder that cannot be used, naming the file.
     """
@@ -42,7 +44,7 @@ def load(root: Path) -> Dataset:
     frames = [_frame(file) for file in files]
     points, colors = sparse_points(root) or (None, None)
     return Dataset(
-        **load_split(root, frames, _held_out(root, [frame.name for frame in frames])),
+        **load_split(root, frames, _held_out(root, [frame.name for frame in frames]), longest),
         points=points,
         point_colors=colors,
         root=root,

@@ -20,6 +20,7 @@ class View:
       masked: whether the photograph came with an alpha channel or mask
       normal: [H, W, 3] float32 unit normals in world space (0 where there is none), or None
       path:   the image file
+      scaled_from: (width, height) of the file where the photograph was scaled when read, else None
     """
 
     name: str
@@ -28,6 +29,7 @@ class View:
     masked: bool
     normal: np.ndarray | None
     path: Path
+    scaled_from: tuple[int, int] | None = None
 
     @property
     def alpha(self) -> np.ndarray:

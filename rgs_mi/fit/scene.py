@@ -11,6 +11,7 @@ from ..core.runtime import cache_folder
 from ..core.scene_files import load_scene
 from ..datasets import load_dataset
 from ..datasets.path_traced import render_dataset
+from ..datasets.resolution import LONGEST
 from ..datasets.types import Dataset
 from ..plugins import deferred_of, surfels_of
 from ..settings.config import load_config
@@ -107,12 +108,13 @@ class FitScene:
             raise UserError("settings: minutes and iterations are both null: give one of them, which bounds the fit")
         return settings
 
-    def dataset(self, quiet: bool = False) -> Dataset:
-        """Return the photographs; those of a scene are path-traced on first use, which takes minutes.
+    def dataset(self, longest: int = LONGEST, quiet: bool = False) -> Dataset:
+        """Return the photographs, scaled where they have more than ``longest`` pixels along a side; those of a scene are
+        path-traced on first use, which takes minutes.
 
         Raises: UserError for photographs that can't be read.
         """
         folder = self.photographs
         if folder.suffix == ".xml":
             folder = render_dataset(folder, cache_folder(folder.stem), quiet=quiet)
-        return load_dataset(folder)
+        return load_dataset(folder, longest, quiet)

@@ -2,6 +2,7 @@
 
 import io
 import re
+from collections.abc import Callable, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ from .figures import number
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_SIZE = 6.6, 3.5  # inches of 72 pixels
+_SIZE, _SIDE = (6.6, 3.5), 4.7  # inches of 72 pixels
 _INKS = "#1f5fa8", "#c4572b", "#35803f", "#7a4ea3", "#97791a", "#666c73"
 _SOFT, _LINE, _BOUND = "#626a73", "#d9dde2", "#b33333"
 _STYLE: dict[Any, Any] = {
@@ -46,24 +47,28 @@ def curves(
     The x axis begins at zero, the y axis at ``low`` (None: at the least), or is logarithmic where ``log``. What is not
     finite, or has no logarithm, is left out.
     """
+    return _svg(lambda: draw(series, x_label, y_label, lines or {}, marks or {}, low, log), f"{y_label} over {x_label}")
+
+
+def _svg(drawn: "Callable[[], Figure]", words: str) -> str:
+    """The figure that a callback draws in this style as an SVG element, which ``words`` tell to those who don't see it."""
     from matplotlib import rc_context
 
     with rc_context(_STYLE):
         stream = io.StringIO()
-        figure = draw(series, x_label, y_label, lines or {}, marks or {}, low, log)
-        figure.savefig(stream, format="svg", transparent=True, metadata=_NO_METADATA)
+        drawn().savefig(stream, format="svg", transparent=True, metadata=_NO_METADATA)
     # Names of groups would be there twice in a page, and namespaces need not be told in HTML.
     _, _, text = stream.getvalue().partition('viewBox="')
     box, _, text = text.partition('"')
     content = text.partition(">")[2]
     content = re.sub(r' id="[\w.]+_\d+"', "", content)
-    return f'<svg viewBox="{box}" role="img" aria-label="{escape(f"{y_label} over {x_label}")}">{content.strip()}'
+    return f'<svg viewBox="{box}" role="img" aria-label="{escape(words)}">{content.strip()}'
 
 
 def draw(series: dict, x_label: str, y_label: str, lines: dict, marks: dict, low: float | None, log: bool) -> "Figure":
     """Return the `matplotlib.figure.Figure` of `curves`."""
     from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter, NullFormatter
+    from matplotlib.ticker import NullFormatter
 
     figure = Figure(_SIZE, layout="constrained")
     axes = figure.add_subplot()
@@ -86,16 +91,88 @@ def draw(series: dict, x_label: str, y_label: str, lines: dict, marks: dict, low
     for name, x in marks.items():
         axes.axvline(x, color=_SOFT, linestyle=":", linewidth=0.9)
         axes.annotate(name, (x, 1), (3, 2), xycoords=axes.get_xaxis_transform(), textcoords="offset points")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
-    axes.grid(axis="y", linewidth=0.8)
-    axes.tick_params(which="both", length=0)
-    axes.spines[["left", "top", "right"]].set_visible(False)
+    _plain(axes)
     axes.set_xlabel(x_label)
     axes.set_title(y_label, loc="left", fontsize=_STYLE["font.size"], pad=18 if marks else 8)
     if len(series) > 1:
         axes.legend(loc="upper left", bbox_to_anchor=(1, 1), frameon=False, labelcolor="linecolor", handlelength=0.8)
     return figure
+
+
+def bars(values: Sequence[float], bad: Sequence[bool], x_label: str, y_label: str) -> str:
+    """Plot ``values``, one a photograph in their order, as bars from zero, and return an SVG element; those that are ``bad``
+    stand out, and what is not finite has no bar."""
+    from matplotlib.figure import Figure
+
+    def drawn():
+        figure = Figure(_SIZE, layout="constrained")
+        axes = figure.add_subplot()
+        heights = np.nan_to_num(np.asarray(values, float), posinf=0, neginf=0)
+        inks = [_INKS[1] if odd else _INKS[0] for odd in bad]
+        axes.bar(np.arange(1, len(heights) + 1), heights, color=inks, width=0.8)
+        _plain(axes)
+        axes.set_xlim(0, len(heights) + 1)
+        axes.set_xlabel(x_label)
+        axes.set_title(y_label, loc="left", fontsize=_STYLE["font.size"], pad=8)
+        return figure
+
+    return _svg(drawn, f"{y_label}, a bar each")
+
+
+def cameras(origins: np.ndarray, axes: np.ndarray, points: np.ndarray, gap: tuple[float, float] | None) -> list[str]:
+    """Plot where cameras stand, from above and from the side, and return two SVG elements.
+
+    Args:
+      origins: [N, 3] positions, in the order of the photographs, z up
+      axes:    [N, 3] unit directions of view
+      points:  [M, 3] points of the scene
+      gap:     azimuth in degrees at which a part of the way around without cameras begins, and how wide it is; None: none
+    """
+    reach = 1.25 * float(np.abs(origins).max())
+    near = points[(np.abs(points) < reach).all(1)]
+    around = np.hypot(origins[:, 0], origins[:, 1])
+    across = np.einsum("ij,ij->i", axes[:, :2], origins[:, :2]) / np.maximum(around, 1e-9)
+    above = lambda: _places(origins[:, :2], axes[:, :2], near[:, :2], gap, reach, "from above: x and y", True)
+    side = np.stack([around, origins[:, 2]], 1), np.stack([across, axes[:, 2]], 1)
+    cloud = np.stack([np.hypot(near[:, 0], near[:, 1]), near[:, 2]], 1)
+    beside = lambda: _places(*side, cloud, None, reach, "from the side: distance from the vertical, and z", False)
+    return [_svg(above, "cameras from above"), _svg(beside, "cameras from the side")]
+
+
+def _places(origins, axes, points, gap, reach, title, numbered):
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Wedge
+
+    figure = Figure((_SIDE, _SIDE), layout="constrained")
+    plot = figure.add_subplot()
+    if gap:
+        plot.add_patch(Wedge((0, 0), reach, gap[0], sum(gap), color=_BOUND, alpha=0.12, linewidth=0))
+    plot.scatter(*points.T, s=1.2, color=_SOFT, alpha=0.35, linewidths=0, rasterized=True)
+    plot.plot(*origins.T, color=_LINE, linewidth=0.8, zorder=1)
+    plot.quiver(*origins.T, *axes.T, color=_INKS[0], angles="xy", scale_units="xy", scale=7 / reach, width=0.004, zorder=2)
+    plot.scatter(*origins.T, s=12, color=_INKS[0], zorder=3)
+    for k in range(0, len(origins) if numbered else 0, max(len(origins) // 12, 1)):
+        plot.annotate(str(k + 1), origins[k], (4, 4), textcoords="offset points")
+    plot.plot(0, 0, "+", color=_BOUND, markersize=9)
+    plot.set_aspect("equal")
+    plot.set_xlim(-reach if origins[:, 0].min() < 0 or gap else -0.1 * reach, reach)
+    low = min(float(origins[:, 1].min()) - 0.15 * reach, -0.35 * reach)
+    plot.set_ylim(low if not gap else -reach, reach)
+    _plain(plot)
+    plot.set_title(title, loc="left", fontsize=_STYLE["font.size"], pad=8)
+    return figure
+
+
+def _plain(axes):
+    """Plain numbers at the axes, and lines only where one reads along."""
+    from matplotlib.ticker import FuncFormatter
+
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+    axes.grid(axis="y", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.tick_params(which="both", length=0)
+    axes.spines[["left", "top", "right"]].set_visible(False)
 
 
 def _decades(axes, heights):

@@ -173,6 +173,12 @@ class Settings:
         le=64,
         description="Samples per pixel of what a fit leaves behind, on a grid; its steps take one.",
     )
+    resolution: int = Field(
+        default=1600,
+        ge=16,
+        le=8192,
+        description="Photographs are scaled to this longer side when read, if theirs is longer.",
+    )
     background: float = Field(
         default=1.0, ge=0, le=1, description="Display grey level behind masked objects, in training and in figures."
     )

@@ -18,6 +18,7 @@ from captures import (
     write_blender,
     write_cloud,
     write_colmap,
+    write_llff,
     write_nerfstudio,
     write_nero,
 )
@@ -47,6 +48,7 @@ LAYOUTS = {
     "blender": lambda folder: write_blender(folder, photographs()),
     "nerfstudio": lambda folder: write_nerfstudio(folder, photographs(k1=-0.1), camera_model="OPENCV", k1=-0.1),
     "colmap": lambda folder: write_colmap(folder, photographs(k1=0.1), "SIMPLE_RADIAL", (95, *PRINCIPAL, 0.1)),
+    "llff": lambda folder: write_llff(folder, photographs()),
     "nero": nero_with_masks,
 }
 
@@ -58,7 +60,7 @@ def test_fit(inputs, tmp_path, monkeypatch, layout):
     data = LAYOUTS[layout](tmp_path / layout)
     if layout == "blender":
         write_cloud(data / "points3d.ply")
-    square = nullcontext() if layout == "colmap" else pytest.warns(UserWarning, match="pixels are not square")
+    square = nullcontext() if layout in ("colmap", "llff") else pytest.warns(UserWarning, match="pixels are not square")
     with square:
         folder = optimize(inputs[0], data=data, out=tmp_path / "run", overrides=FEW, quiet=True)
     figures = json.loads((folder / "metrics.json").read_text())
