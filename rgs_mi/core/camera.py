@@ -1,19 +1,21 @@
-"""Pinhole cameras: one small value type between data sets, Mitsuba sensors and the splatter.
+"""Cameras: one small value type between data sets, Mitsuba sensors and the splatter.
 
 Frames. World space is whatever the scene uses. Camera space here is the computer-vision one: x right, y down, z along
-the viewing direction, so that depth is z and pixel = focal * (x/z, y/z) + principal point. Mitsuba's own camera space
-(x left, y up, z forward) appears only in `from_sensor` and `to_sensor_dict`.
+the viewing direction, so that depth is z and pixel = focal * (x/z, y/z) + principal point, after what a lens does to
+(x/z, y/z) where there is one. Mitsuba's own camera space (x left, y up, z forward) appears only in `from_sensor` and
+`to_sensor_dict`.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from .errors import UserError
+from .lens import Lens
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -22,20 +24,44 @@ _MITSUBA_TO_CV = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
+class LearnedCamera:
+    """What a fit learns of a camera: differentiable Dr.Jit values of width 1 that take the place of a `Camera`'s own numbers,
+    and that `Camera.resized` and `Camera.cropped` leave as they are.
+
+    rotation  world to camera, [3, 3]
+    origin    position of the pinhole, world space
+    zoom      factors of the focal lengths
+    shift     of the principal point, in units of the focal lengths
+    lens      its distortion
+    """
+
+    rotation: "mi.Matrix3f"
+    origin: "mi.Point3f"
+    zoom: "mi.Vector2f"
+    shift: "mi.Vector2f"
+    lens: Lens
+
+
+@dataclass(frozen=True)
 class Camera:
-    """A pinhole camera.
+    """A pinhole camera, perhaps with a lens.
 
     Attributes
       to_world:  [4, 4] float64, camera space (x right, y down, z forward) to world space, rigid
       focal:     (fx, fy) in pixels
       principal: (cx, cy) in pixels, from the upper left corner of the image; (width/2, height/2) is the centre
       size:      (width, height) in pixels
+      lens:      distortion of the photograph, or None
+      learned:   what a fit has in place of these numbers, or None. Functions on Dr.Jit arrays see it, those on NumPy arrays
+                 do not: see `baked`
     """
 
     to_world: np.ndarray
     focal: tuple[float, float]
     principal: tuple[float, float]
     size: tuple[int, int]
+    lens: Lens | None = None
+    learned: LearnedCamera | None = None
 
     @property
     def origin(self) -> np.ndarray:
@@ -51,7 +77,10 @@ class Camera:
         """Project world ``points`` [N, 3]; return pixels [N, 2] and depths z [N]. Pixels mean nothing where z ≤ 0."""
         p = (np.asarray(points) - self.origin) @ self.rotation.T
         z = p[:, 2]
-        return p[:, :2] / np.where(z == 0, 1e-9, z)[:, None] * self.focal + self.principal, z
+        plane = p[:, :2] / np.where(z == 0, 1e-9, z)[:, None]
+        if self.lens is not None:
+            plane = np.stack(self.lens.distort(*plane.T), -1)
+        return plane * self.focal + self.principal, z
 
     def image_plane(self) -> tuple[np.ndarray, np.ndarray]:
         """Return x/z and y/z, each [H, W], of the camera-space rays through the pixel centers."""
@@ -59,7 +88,7 @@ class Camera:
         x = (np.arange(width) + 0.5 - self.principal[0]) / self.focal[0]
         y = (np.arange(height) + 0.5 - self.principal[1]) / self.focal[1]
         x, y = np.meshgrid(x, y)
-        return x, y
+        return (x, y) if self.lens is None else self.lens.undistort(x, y)
 
     def rays(self) -> np.ndarray:
         """Return the world-space rays through the pixel centers, [H, W, 3], of unit camera-space z: origin + depth · ray is
@@ -86,6 +115,21 @@ class Camera:
     def cropped(self, x: int, y: int, width: int, height: int) -> "Camera":
         """Return the same camera, restricted to the window of ``width`` × ``height`` pixels whose corner is pixel (x, y)."""
         return replace(self, principal=(self.principal[0] - x, self.principal[1] - y), size=(width, height))
+
+    def baked(self) -> "Camera":
+        """Return the same camera with numbers in place of what was ``learned``."""
+        if self.learned is None:
+            return self
+        values, to_world = self.learned, np.eye(4)
+        number = lambda v: float(np.array(v, np.float64).ravel()[0])
+        numbers = lambda v: np.array([number(c) for c in v])
+        # Single precision leaves a rotation a ten-millionth short of rigid
+        u, _, vh = np.linalg.svd([[number(values.rotation[i, j]) for j in range(3)] for i in range(3)])
+        to_world[:3, :3], to_world[:3, 3] = (u @ vh).T, numbers(values.origin)
+        principal = np.add(self.principal, numbers(values.shift) * self.focal)
+        fx, fy = numbers(values.zoom) * self.focal
+        lens = Lens(*map(number, values.lens.coefficients), number(values.lens.reach))
+        return Camera(to_world, (float(fx), float(fy)), (float(principal[0]), float(principal[1])), self.size, lens)
 
     @classmethod
     def look_at(
@@ -127,7 +171,7 @@ class Camera:
 
     def to_sensor_dict(self) -> dict:
         """Return a Mitsuba `perspective` sensor (as for ``mi.load_dict``) with this camera's view, whose pixels must be
-        square."""
+        square. It has no lens."""
         import mitsuba as mi
 
         width, height = self.size
@@ -145,18 +189,35 @@ class Camera:
 # ---- On Dr.Jit arrays ----
 
 
-def opaque(camera: Camera) -> tuple["mi.Matrix3f", "mi.Point3f", "mi.Vector2f", "mi.Vector2f"]:
-    """Return the camera's numbers as opaque Dr.Jit values (literals would recompile the kernels at every pose): rotation
-    (world to camera), origin (world space), focal length and principal point (pixels)."""
+class Projection(NamedTuple):
+    """A camera as kernels see it: ``rotation`` (world to camera), ``origin`` (world space), ``focal`` length and ``principal``
+    point (pixels), Dr.Jit values of width 1, and the ``lens``, None for a pinhole's."""
+
+    rotation: "mi.Matrix3f"
+    origin: "mi.Point3f"
+    focal: "mi.Vector2f"
+    principal: "mi.Vector2f"
+    lens: Lens | None
+
+
+def opaque(camera: Camera) -> Projection:
+    """Return the camera's numbers as opaque Dr.Jit values (literals would recompile the kernels at every pose), and what is
+    learned of it in their place, differentiable."""
     import drjit as dr
     import mitsuba as mi
 
     scalar = lambda v: dr.opaque(mi.Float, float(v))
-    return (
+    focal, principal = mi.Vector2f(*map(scalar, camera.focal)), mi.Vector2f(*map(scalar, camera.principal))
+    if (learned := camera.learned) is not None:
+        return Projection(
+            learned.rotation, learned.origin, focal * learned.zoom, principal + focal * learned.shift, learned.lens
+        )
+    return Projection(
         mi.Matrix3f([[scalar(v) for v in row] for row in camera.rotation]),
         mi.Point3f(*map(scalar, camera.origin)),
-        mi.Vector2f(*map(scalar, camera.focal)),
-        mi.Vector2f(*map(scalar, camera.principal)),
+        focal,
+        principal,
+        camera.lens and Lens(*map(scalar, camera.lens.coefficients), scalar(camera.lens.reach)),
     )
 
 
@@ -165,10 +226,12 @@ def pixel_rays(camera: Camera, index: "mi.UInt32") -> "mi.Vector3f":
     `Camera.rays`, their twin on NumPy arrays."""
     import mitsuba as mi
 
-    R, _, f, principal = opaque(camera)
+    R, _, f, principal, lens = opaque(camera)
     width = camera.size[0]
     x = (mi.Float(index % width) + 0.5 - principal.x) / f.x
     y = (mi.Float(index // width) + 0.5 - principal.y) / f.y
+    if lens is not None:
+        x, y = lens.undistort(x, y)
     return R.T @ mi.Vector3f(x, y, 1)
 
 
