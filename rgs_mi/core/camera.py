@@ -15,31 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import UserError
+from .learned_camera import LearnedCamera
 from .lens import Lens
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
 _MITSUBA_TO_CV = np.diag([-1.0, -1.0, 1.0, 1.0])
-
-
-@dataclass(frozen=True)
-class LearnedCamera:
-    """What a fit learns of a camera: differentiable Dr.Jit values of width 1 that take the place of a `Camera`'s own numbers,
-    and that `Camera.resized` and `Camera.cropped` leave as they are.
-
-    rotation  world to camera, [3, 3]
-    origin    position of the pinhole, world space
-    zoom      factors of the focal lengths
-    shift     of the principal point, in units of the focal lengths
-    lens      its distortion
-    """
-
-    rotation: "mi.Matrix3f"
-    origin: "mi.Point3f"
-    zoom: "mi.Vector2f"
-    shift: "mi.Vector2f"
-    lens: Lens
 
 
 @dataclass(frozen=True)

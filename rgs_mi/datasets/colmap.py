@@ -55,6 +55,7 @@ def load(root: Path) -> Dataset:
         points=points,
         point_colors=colors,
         root=root,
+        photographed=True,
     )
 
 

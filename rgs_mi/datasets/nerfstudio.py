@@ -48,7 +48,7 @@ def load(root: Path) -> Dataset:
     frames = [_frame(file, meta, index) for index in range(len(meta["frames"]))]
     kept, held_out = _split(file, meta, frames)
     points, colors = _points(file, meta) or (None, None)
-    return Dataset(**load_split(file, kept, held_out), points=points, point_colors=colors, root=root)
+    return Dataset(**load_split(file, kept, held_out), points=points, point_colors=colors, root=root, photographed=True)
 
 
 def _frame(file: Path, meta: dict, index: int) -> Frame:

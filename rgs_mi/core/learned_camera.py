@@ -1,0 +1,85 @@
+"""A camera as small corrections of the one that was given, differentiable (docs/method.md §2)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .lens import Lens
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from .camera import Camera
+
+POSE = ("turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z")
+INTRINSICS = ("log_fx", "log_fy", "cx", "cy", "k1", "k2", "p1", "p2")
+_BEYOND = 1.2  # a lens holds so much farther than to the picture's corner
+
+
+@dataclass(frozen=True)
+class LearnedCamera:
+    """What a fit learns of a camera: differentiable Dr.Jit values of width 1 that take the place of a `Camera`'s own numbers,
+    and that `Camera.resized` and `Camera.cropped` leave as they are.
+
+    rotation  world to camera, [3, 3]
+    origin    position of the pinhole, world space
+    zoom      factors of the focal lengths
+    shift     of the principal point, in units of the focal lengths
+    lens      its distortion
+    """
+
+    rotation: "mi.Matrix3f"
+    origin: "mi.Point3f"
+    zoom: "mi.Vector2f"
+    shift: "mi.Vector2f"
+    lens: Lens
+
+
+def learned_camera(
+    camera: "Camera",
+    pivot: np.ndarray,
+    pose: "Sequence[mi.Float]",
+    intrinsics: "Sequence[mi.Float] | None" = None,
+) -> LearnedCamera:
+    """Return ``camera`` with its corrections, evaluated.
+
+    ``pose`` are the six numbers (ω, τ) of `POSE`: with x a point in world space, c the ``pivot`` ([3], world space), R and o
+    the camera's rotation and origin, and d = |c − o|, the point is in camera space at
+
+        exp(ω) R (x − c) + R (c − o) + d τ                                                          (12)
+
+    so that ω turns the scene about the pivot and τ moves its picture, by f τ pixels and by the part τ_z of its size: six
+    numbers that do much the same each, in radians, where turning and moving the camera would do almost the same. exp is of
+    third order here: a rotation by 2 atan(|ω|/2).
+
+    ``intrinsics`` are the eight numbers of `INTRINSICS` (None: as given): logarithms of factors of the focal lengths, the
+    shift of the principal point in units of these, and what is added to the coefficients of `Lens`, each in units of what it
+    moves where the lens ends, relative to the radius there.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    scalar = lambda v: dr.opaque(mi.Float, float(v))
+    given = mi.Matrix3f([[scalar(v) for v in row] for row in camera.rotation])
+    to_pivot = camera.rotation @ (np.asarray(pivot) - camera.origin)
+    turn, move = mi.Vector3f(*pose[:3]), mi.Vector3f(*pose[3:])
+    quaternion = mi.Quaternion4f(*(0.5 * turn), 1)
+    rotation = dr.quat_to_matrix(mi.Matrix3f, quaternion / dr.norm(quaternion)) @ given
+    moved = mi.Vector3f(*map(scalar, to_pivot)) + scalar(np.linalg.norm(to_pivot)) * move
+    origin = mi.Point3f(*map(scalar, pivot)) - rotation.T @ moved
+    numbers, lens = intrinsics or [scalar(0)] * len(INTRINSICS), camera.lens or Lens(reach=lens_reach(camera))
+    coefficients = [
+        scalar(k) + n / scalar(lens.reach**power) for k, n, power in zip(lens.coefficients, numbers[4:], (2, 4, 1, 1))
+    ]
+    zoom, shift = dr.exp(mi.Vector2f(*numbers[:2])), mi.Vector2f(*numbers[2:4])
+    dr.eval(rotation, origin, zoom, shift, coefficients)  # kernels that see the camera have it as inputs
+    return LearnedCamera(rotation, origin, zoom, shift, Lens(*coefficients, scalar(lens.reach)))
+
+
+def lens_reach(camera: "Camera") -> float:
+    """Return the radius in x/z units up to which a lens of this camera holds: a little farther than the whole picture's
+    corner."""
+    far = np.maximum(camera.principal, np.subtract(camera.size, camera.principal)) / camera.focal
+    return _BEYOND * float(np.linalg.norm(far))
