@@ -20,7 +20,7 @@ from .tiles import BLOCK, LOW_PASS, Cutoffs
 if TYPE_CHECKING:
     from ..surfels.surfels import Surfels
 
-_STEP = 0.02  # x/z units, from point to point of central differences
+_STEP = 0.005  # x/z units, from point to point of central differences
 
 
 def _about(lens, x, y, dx, dy):
