@@ -102,15 +102,12 @@ class Camera:
         """Return the same camera with numbers in place of what was ``learned``."""
         if self.learned is None:
             return self
-        values, to_world = self.learned, np.eye(4)
-        number = lambda v: float(np.array(v, np.float64).ravel()[0])
-        numbers = lambda v: np.array([number(c) for c in v])
-        # Single precision leaves a rotation a ten-millionth short of rigid
-        u, _, vh = np.linalg.svd([[number(values.rotation[i, j]) for j in range(3)] for i in range(3)])
-        to_world[:3, :3], to_world[:3, 3] = (u @ vh).T, numbers(values.origin)
-        principal = np.add(self.principal, numbers(values.shift) * self.focal)
-        fx, fy = numbers(values.zoom) * self.focal
-        lens = Lens(*map(number, values.lens.coefficients), number(values.lens.reach))
+        rotation, origin, zoom, shift, lens = np.split(self.learned.values.numpy().astype(np.float64), [9, 12, 14, 16])
+        u, _, vh = np.linalg.svd(rotation.reshape(3, 3))  # single precision leaves it a ten-millionth short of rigid
+        to_world = np.eye(4)
+        to_world[:3, :3], to_world[:3, 3] = (u @ vh).T, origin
+        (fx, fy), principal = zoom * self.focal, self.principal + shift * self.focal
+        lens = Lens(*lens.tolist(), self.learned.reach)
         return Camera(to_world, (float(fx), float(fy)), (float(principal[0]), float(principal[1])), self.size, lens)
 
     @classmethod
@@ -173,7 +170,7 @@ class Camera:
 
 class Projection(NamedTuple):
     """A camera as kernels see it: ``rotation`` (world to camera), ``origin`` (world space), ``focal`` length and ``principal``
-    point (pixels), Dr.Jit values of width 1, and the ``lens``, None for a pinhole's."""
+    point (pixels), Dr.Jit values, and the ``lens``, None for a pinhole's."""
 
     rotation: "mi.Matrix3f"
     origin: "mi.Point3f"
@@ -182,18 +179,17 @@ class Projection(NamedTuple):
     lens: Lens | None
 
 
-def opaque(camera: Camera) -> Projection:
+def opaque(camera: Camera, width: int = 1) -> Projection:
     """Return the camera's numbers as opaque Dr.Jit values (literals would recompile the kernels at every pose), and what is
-    learned of it in their place, differentiable."""
+    learned of it in their place, differentiable; that is of the ``width`` of what the kernel works on."""
     import drjit as dr
     import mitsuba as mi
 
     scalar = lambda v: dr.opaque(mi.Float, float(v))
     focal, principal = mi.Vector2f(*map(scalar, camera.focal)), mi.Vector2f(*map(scalar, camera.principal))
-    if (learned := camera.learned) is not None:
-        return Projection(
-            learned.rotation, learned.origin, focal * learned.zoom, principal + focal * learned.shift, learned.lens
-        )
+    if camera.learned is not None:
+        rotation, origin, zoom, shift, lens = camera.learned.numbers(width)
+        return Projection(rotation, origin, focal * zoom, principal + focal * shift, lens)
     return Projection(
         mi.Matrix3f([[scalar(v) for v in row] for row in camera.rotation]),
         mi.Point3f(*map(scalar, camera.origin)),
@@ -206,9 +202,10 @@ def opaque(camera: Camera) -> Projection:
 def pixel_rays(camera: Camera, index: "mi.UInt32") -> "mi.Vector3f":
     """Return the world-space rays through the centers of the pixels ``index`` (row-major), of unit camera-space z; see
     `Camera.rays`, their twin on NumPy arrays."""
+    import drjit as dr
     import mitsuba as mi
 
-    R, _, f, principal, lens = opaque(camera)
+    R, _, f, principal, lens = opaque(camera, dr.width(index))
     width = camera.size[0]
     x = (mi.Float(index % width) + 0.5 - principal.x) / f.x
     y = (mi.Float(index // width) + 0.5 - principal.y) / f.y

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -15,26 +15,41 @@ if TYPE_CHECKING:
 
 POSE = ("turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z")
 INTRINSICS = ("log_fx", "log_fy", "cx", "cy", "k1", "k2", "p1", "p2")
+_COUNT = 20  # of `Numbers`
 _BEYOND = 1.2  # a lens holds so much farther than to the picture's corner
 
 
-@dataclass(frozen=True)
-class LearnedCamera:
-    """What a fit learns of a camera: differentiable Dr.Jit values of width 1 that take the place of a `Camera`'s own numbers,
-    and that `Camera.resized` and `Camera.cropped` leave as they are.
-
-    rotation  world to camera, [3, 3]
-    origin    position of the pinhole, world space
-    zoom      factors of the focal lengths
-    shift     of the principal point, in units of the focal lengths
-    lens      its distortion
-    """
+class Numbers(NamedTuple):
+    """The numbers of a camera that take the place of its own: ``rotation`` (world to camera), ``origin`` (world space), ``zoom``,
+    factors of the focal lengths, ``shift`` of the principal point in units of the focal lengths, and ``lens``."""
 
     rotation: "mi.Matrix3f"
     origin: "mi.Point3f"
     zoom: "mi.Vector2f"
     shift: "mi.Vector2f"
     lens: Lens
+
+
+@dataclass(frozen=True)
+class LearnedCamera:
+    """What a fit learns of a camera: `Numbers` that `Camera.resized` and `Camera.cropped` leave as they are, one after another
+    in ``values``, a differentiable Dr.Jit array; ``reach`` is that of the lens."""
+
+    values: "mi.Float"
+    reach: float
+
+    def numbers(self, width: int = 1) -> Numbers:
+        """Return the numbers, ``width`` times each. Kernels that see a camera from so many pixels or surfels add its gradients
+        up as they go; of numbers of width 1 each use would cost a kernel that sums."""
+        import drjit as dr
+        import mitsuba as mi
+
+        at = lambda k: dr.gather(mi.Float, self.values, dr.full(mi.UInt32, k, width), mode=dr.ReduceMode.Expand)
+        v = [at(k) for k in range(_COUNT)]
+        lens = Lens(*v[16:20], dr.opaque(mi.Float, self.reach))
+        return Numbers(
+            mi.Matrix3f(v[0:3], v[3:6], v[6:9]), mi.Point3f(*v[9:12]), mi.Vector2f(*v[12:14]), mi.Vector2f(*v[14:16]), lens
+        )
 
 
 def learned_camera(
@@ -74,8 +89,12 @@ def learned_camera(
         scalar(k) + n / scalar(lens.reach**power) for k, n, power in zip(lens.coefficients, numbers[4:], (2, 4, 1, 1))
     ]
     zoom, shift = dr.exp(mi.Vector2f(*numbers[:2])), mi.Vector2f(*numbers[2:4])
-    dr.eval(rotation, origin, zoom, shift, coefficients)  # kernels that see the camera have it as inputs
-    return LearnedCamera(rotation, origin, zoom, shift, Lens(*coefficients, scalar(lens.reach)))
+    values = dr.zeros(mi.Float, _COUNT)
+    rows = [rotation[i, j] for i in range(3) for j in range(3)]
+    for k, value in enumerate([*rows, *origin, *zoom, *shift, *coefficients]):
+        dr.scatter(values, value, mi.UInt32(k))
+    dr.eval(values)
+    return LearnedCamera(values, float(lens.reach))
 
 
 def lens_reach(camera: "Camera") -> float:

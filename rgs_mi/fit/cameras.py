@@ -113,8 +113,10 @@ class Cameras:
         """Move what the views seen since the last step have gradients for, at the ``rates`` of `POSES`, `LENSES` and
         `EXPOSURE`; then take out what surfels and light could follow: a similarity of the world, and a gain of all."""
         gradients: dict[str, dict[int, np.ndarray]] = {name: {} for name in self.rows}
-        for name, row, leaf in self._leaves:
-            gradient = np.array([float(dr.grad(v)[0]) for v in leaf])
+        found = [[dr.grad(v) for v in leaf] for _, _, leaf in self._leaves]
+        dr.eval(found)
+        for (name, row, _), leaf in zip(self._leaves, found):
+            gradient = np.array([float(v[0]) for v in leaf])
             gradients[name][row] = gradients[name].get(row, 0) + gradient
         self._leaves.clear()
         for name, found in gradients.items():

@@ -47,7 +47,7 @@ def within(gbuffer: GBuffer, camera: Camera, box: BoundingBox | None) -> "mi.Boo
 
 def _points(camera, direction, depth):
     """World-space points along unit ``direction`` at a ``depth`` (z)."""
-    seen = opaque(camera)
+    seen = opaque(camera, dr.width(direction))
     return seen.origin + direction * (depth / (seen.rotation @ direction).z)
 
 

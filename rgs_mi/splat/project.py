@@ -54,7 +54,7 @@ def project(surfels: "Surfels", camera: Camera, means2d_offset: "mi.Vector2f | N
     ``means2d_offset`` (pixels, width N) is added to the projected centers: zeros with gradients enabled obtain the gradient
     on the image plane that density control accumulates.
     """
-    R, origin, f, principal, lens = opaque(camera)
+    R, origin, f, principal, lens = opaque(camera, len(surfels))
     offset = surfels.column(mi.Vector3f, "centers") - origin
     p = R @ offset
     t_u, t_v, n_world = surfels.frames()

@@ -180,7 +180,7 @@ def test_gauge(dataset):
     cameras, rng = Cameras([v.camera for v in dataset.train], True, True), np.random.default_rng(0)
     for view in (0, 3, 5, 1):
         s = cameras.see(view, dataset.train[view].camera, SETTINGS.weights)
-        pulled = [*s.camera.learned.origin, *s.gain]
+        pulled = [*s.camera.learned.numbers().origin, *s.gain]
         dr.backward(sum(v * float(w) for v, w in zip(pulled, rng.normal(size=6))) + s.prior)
         cameras.step({POSES: 1e-2, LENSES: 1e-3, EXPOSURE: 1e-2})
     assert np.abs(cameras.rows[POSES].value).max() > 3e-3 and np.abs(cameras.rows[EXPOSURE].value).max() > 3e-3
