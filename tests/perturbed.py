@@ -6,6 +6,7 @@
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,12 +40,18 @@ def main():
     parser.add_argument("out", type=Path)
     parser.add_argument("--clean", action="store_true", help="the data set as it is")
     parser.add_argument("--seed", type=int, default=0, help="of what is perturbed")
-    parser.add_argument("--dilation", type=int, default=3, help="pixels that masks are too large")
+    parser.add_argument("--dilation", type=int, default=3, help="pixels that masks are too large; -1: masks as they are")
+    parser.add_argument("--every", type=int, default=1, help="only every so many training views")
     parser.add_argument("--set", action="append", default=[], dest="overrides", metavar="NAME=VALUE")
     args = parser.parse_args()
     rgs_mi.set_variant()
     scene, truth = FitScene.load(SCENE, args.data), load_dataset(args.data)
-    dataset, exposures = (truth, {}) if args.clean else perturbed(truth, seed=args.seed, dilation=args.dilation)
+    truth = replace(truth, train=truth.train[:: args.every])
+    dataset, exposures = (
+        (truth, {})
+        if args.clean
+        else perturbed(truth, seed=args.seed, dilation=args.dilation if args.dilation >= 0 else None)
+    )
     cameras = [view.camera for view in truth.train]
     center, _ = focus_point(cameras)
     distance = float(np.mean([np.linalg.norm(c.origin - center) for c in cameras]))

@@ -20,7 +20,7 @@ from ..shading import deferred
 from ..shading.lighting import Lighting
 from ..surfels.surfels import Surfels
 
-_LEVELS, _LEAST = (8, 4, 2), 24  # pixels of a photograph's side that make one of a level's; its least height
+_LEVELS, _LEAST = (8, 4, 2, 1), 24  # pixels of a photograph's side that make one of a level's; its least height
 _STEPS = 6  # of Levenberg and Marquardt, at most, on each level
 _PROBE = 0.5  # pixels that differences of poses move a picture by
 _STILL = 0.02  # pixels: a step that moves a picture by less is the last

@@ -14,6 +14,7 @@ from ..settings.settings import Settings, Weights
 
 #: Names of what is learned: a row per view, per camera, and per view.
 POSES, LENSES, EXPOSURE = "poses", "intrinsics", "exposure"
+_POINTS, _NEAREST, _FLOOR = 500, 0.8, 1e-3  # of `_whitening`: points; most part of the distance; least eigenvalue
 _BETA = 0.9, 0.99  # of Adam; a row moves but some ten times in a fit, so its moments forget sooner than those of surfels
 
 
@@ -25,16 +26,19 @@ class Rows:
         self.value, self.m, self.v = (np.zeros((count, width)) for _ in range(3))
         self.steps = np.zeros(count, np.int64)
 
-    def step(self, gradients: Mapping[int, np.ndarray], rate: float) -> None:
-        """Move the rows that ``gradients`` {row: [K]} names, where these are finite."""
+    def step(self, gradients: Mapping[int, np.ndarray], rate: float, bases: np.ndarray | None = None) -> None:
+        """Move the rows that ``gradients`` {row: [K]} names, where these are finite; each in coordinates of its own where
+        there are ``bases`` [N, K, K]: a row is its basis times these."""
         for row, gradient in gradients.items():
             if not np.isfinite(gradient).all():
                 continue
+            basis = np.eye(len(gradient)) if bases is None else bases[row]
+            gradient = basis.T @ gradient
             self.steps[row] += 1
             self.m[row] += (1 - _BETA[0]) * (gradient - self.m[row])
             self.v[row] += (1 - _BETA[1]) * (gradient**2 - self.v[row])
             m, v = ((x[row]) / (1 - beta ** self.steps[row]) for x, beta in zip((self.m, self.v), _BETA))
-            self.value[row] -= rate * m / np.maximum(np.sqrt(v), 1e-15)
+            self.value[row] -= rate * basis @ (m / np.maximum(np.sqrt(v), 1e-15))
 
     def state(self) -> dict[str, np.ndarray]:
         """Return all arrays, for a checkpoint."""
@@ -61,10 +65,10 @@ class Cameras:
 
     ``rows``: `POSES` [V, 6] and `LENSES` [C, 8], the numbers of `learned_camera`, where cameras are learned, and `EXPOSURE`
     [V, 3], natural logarithms of gains, where exposures are. Views whose intrinsics are the same share a camera. ``pivot``
-    [3] is the point that the cameras look at, about which they turn.
+    [3] is the point that the cameras look at, about which they turn; ``extent`` is the object's radius in world units.
     """
 
-    def __init__(self, cameras: Sequence[Camera], learn_cameras: bool, learn_exposure: bool) -> None:
+    def __init__(self, cameras: Sequence[Camera], extent: float, learn_cameras: bool, learn_exposure: bool) -> None:
         self.given = list(cameras)
         self.pivot, _ = focus_point(self.given)
         kinds = list(dict.fromkeys(map(_kind, self.given)))
@@ -75,15 +79,17 @@ class Cameras:
         if learn_exposure:
             self.rows[EXPOSURE] = Rows(len(self.given), 3)
         self._modes = _similarities(self.given, self.pivot)
+        self._bases = _whitening(self.given, self.pivot, extent)
         self._leaves: list[tuple[str, int, list[mi.Float]]] = []
 
     @classmethod
-    def of(cls, dataset: Dataset, settings: Settings) -> "Cameras | None":
-        """The corrections that ``settings`` ask for; None where nothing is learned."""
+    def of(cls, dataset: Dataset, settings: Settings, extent: float) -> "Cameras | None":
+        """The corrections that ``settings`` ask for, of photographs of an object of radius ``extent`` in world units; None
+        where nothing is learned."""
         cameras, exposure = learned(dataset, settings)
         if not (cameras or exposure):
             return None
-        return cls([view.camera for view in dataset.train], cameras, exposure)
+        return cls([view.camera for view in dataset.train], extent, cameras, exposure)
 
     # ---- A step ----
 
@@ -120,7 +126,7 @@ class Cameras:
             gradients[name][row] = gradients[name].get(row, 0) + gradient
         self._leaves.clear()
         for name, found in gradients.items():
-            self.rows[name].step(found, rates[name])
+            self.rows[name].step(found, rates[name], self._bases if name == POSES else None)
         if gradients.get(POSES):
             poses = self.rows[POSES].value
             poses -= (self._modes @ (self._modes.T @ poses.ravel())).reshape(poses.shape)
@@ -185,3 +191,33 @@ def _similarities(cameras, pivot) -> np.ndarray:
     flat = modes.reshape(-1, 7)
     u, size, _ = np.linalg.svd(flat / np.maximum(np.linalg.norm(flat, axis=0), 1e-12), full_matrices=False)
     return u[:, size > 1e-6]
+
+
+def _whitening(cameras, pivot, extent) -> np.ndarray:
+    """[V, 6, 6]: bases of poses in which each coordinate moves what is seen of the object by as much, a unit by 1 in x/z units
+    (root mean square), and none does what others do (CamP, Park et al. 2023): C^(−1/2), with C the mean of JᵀJ over the
+    visible side of a sphere of radius ``extent`` and J the derivatives of x/z and y/z by the pose.
+
+    A camera sees the near side of the object alone, which turning about its middle shifts as well: without this the shift
+    would have to be found before the turn shows.
+    """
+    k = np.arange(_POINTS) + 0.5
+    z, azimuth = 1 - 2 * k / _POINTS, np.pi * (1 + 5**0.5) * k
+    sphere = np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], -1)
+    bases = []
+    for camera in cameras:
+        to_pivot = camera.rotation @ (pivot - camera.origin)
+        distance = float(np.linalg.norm(to_pivot))
+        offset = min(extent, _NEAREST * distance) * sphere
+        point = offset + to_pivot
+        cosine = np.maximum(-(point * sphere).sum(1), 0)
+        x, y, depth = point.T
+        zero, one = np.zeros_like(x), np.ones_like(x)
+        dx, dy = np.stack([one, zero, -x / depth], -1), np.stack([zero, one, -y / depth], -1)
+        # A turn ω moves a point by ω × offset, and (ω × offset)·d = ω·(offset × d)
+        jacobian = np.stack([np.concatenate([np.cross(offset, d), distance * d], -1) for d in (dx, dy)]) / depth[:, None]
+        weight = np.where(depth > 0, cosine, 0)
+        covariance = np.einsum("cni,cnj,n->ij", jacobian, jacobian, weight) / max(weight.sum(), 1e-9)
+        size, vectors = np.linalg.eigh(covariance)
+        bases.append((vectors / np.sqrt(np.maximum(size, _FLOOR * size[-1]))) @ vectors.T)
+    return np.array(bases)

@@ -49,7 +49,7 @@ class Fit:
         self.schedule = Schedule.of(settings, shading)
         self.objective = Objective(settings, extent, shading.box)
         self.density = DensityControl(settings.density, extent, shading.box, len(model))
-        self.cameras = Cameras.of(dataset, settings)
+        self.cameras = Cameras.of(dataset, settings, extent)
         self.curves = Curves()
         self.photographs: Photographs | None = None  # of the stage that has begun
         self.step_number, self.views_used, self.elapsed = 0, 0, 0.0

@@ -7,8 +7,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from rgs_mi.core.alignment import pose_errors
 from rgs_mi.core.camera import Camera
 from rgs_mi.core.learned_camera import INTRINSICS, POSE, learned_camera
+from rgs_mi.datasets.photographs import Photographs
 from rgs_mi.fit import losses
 from rgs_mi.fit.cameras import EXPOSURE, LENSES, POSES, Cameras, Rows, _similarities
 from rgs_mi.fit.trainer import Fit
@@ -21,7 +23,8 @@ from rgs_mi.splat.reference import render_gbuffer_reference
 from rgs_mi.splat.tiles import Cutoffs
 from rgs_mi.surfels.surfels import Surfels
 
-from fits import SETTINGS, model
+from captures import perturbed
+from fits import SETTINGS, model, photographed, random_photographs
 from scenes import layered_surfels, orbit_camera, sphere_surfels
 
 SMOOTH = Cutoffs(alpha_min=1e-7, alpha_max=0.9999, transmittance_min=0, resort_window=96)
@@ -175,9 +178,33 @@ def test_similarities_of_the_world_are_invisible():
     assert np.linalg.norm(left) < 0.02 * np.linalg.norm(shift)
 
 
+def test_poses_and_exposures_come_back():
+    """Of photographs whose cameras are a degree off, and of other exposures, under the surfels that they show."""
+    surfels, lighting = photographed()
+    dataset = random_photographs(distance=3.5)
+    others, exposures = perturbed(dataset, degrees=1.0, focal=0.0, quality=None, dilation=None)
+    photographs, truth = Photographs(others.train, 1, 1.0), [v.camera for v in dataset.train]
+    cameras, schedule = Cameras([v.camera for v in others.train], 1.0, True, True), np.geomspace(3e-3, 1e-4, 50)
+    before = pose_errors(cameras.given, truth, 3.5)
+    for rate in schedule:
+        for view in range(6):
+            photo = photographs[view]
+            s = cameras.see(view, photo.camera, SETTINGS.weights)
+            image = deferred.render(surfels, s.camera, lighting)
+            shown = losses.display(image.color * s.gain, image.gbuffer.all.alpha, 1.0)
+            dr.backward(losses.photometric(shown, photo.color, s.camera.size, 0.2) + s.prior)
+            cameras.step({POSES: rate, LENSES: 0.0, EXPOSURE: 10 * rate})
+    after = pose_errors([cameras.camera(k) for k in range(6)], truth, 3.5)
+    assert np.median(before.rotation) > 0.8 and np.median(after.rotation) < 0.2, (before, after)
+    assert np.median(after.position) < 0.3 * np.median(before.position)
+    stops = np.array([exposures[v.name] for v in dataset.train])
+    found = np.log2([cameras.gain(k) for k in range(6)])
+    assert np.abs(found - (stops - stops.mean())[:, None]).max() < 0.05 < np.abs(stops - stops.mean()).max()
+
+
 def test_gauge(dataset):
     """However views pull, the world stays, and so does the mean of the gains."""
-    cameras, rng = Cameras([v.camera for v in dataset.train], True, True), np.random.default_rng(0)
+    cameras, rng = Cameras([v.camera for v in dataset.train], 1.0, True, True), np.random.default_rng(0)
     for view in (0, 3, 5, 1):
         s = cameras.see(view, dataset.train[view].camera, SETTINGS.weights)
         pulled = [*s.camera.learned.numbers().origin, *s.gain]
@@ -190,7 +217,7 @@ def test_gauge(dataset):
 
 def test_who_learns(dataset):
     photographs = replace(dataset, photographed=True)
-    rows = lambda *arguments: set(c.rows) if (c := Cameras.of(*arguments)) else None
+    rows = lambda *arguments: set(c.rows) if (c := Cameras.of(*arguments, 1.0)) else None
     assert rows(dataset, SETTINGS) is None
     assert rows(photographs, SETTINGS) == {POSES, LENSES, EXPOSURE}
     assert rows(photographs, replace(SETTINGS, cameras="fixed")) == {EXPOSURE}
@@ -201,7 +228,7 @@ def test_who_learns(dataset):
 def test_views_of_one_camera_share_its_intrinsics(dataset):
     cameras = [v.camera for v in dataset.train]
     cameras[2:4] = [replace(c, focal=(c.focal[0] * 1.1, c.focal[1])) for c in cameras[2:4]]
-    learned = Cameras(cameras, True, False)
+    learned = Cameras(cameras, 1.0, True, False)
     learned.rows[LENSES].value[:, 0] = [0.01, 0.02]
     factor = [np.log(learned.camera(k).focal[0] / c.focal[0]) for k, c in enumerate(cameras)]
     assert np.allclose(factor, [0.01, 0.01, 0.02, 0.02, 0.01, 0.01])
