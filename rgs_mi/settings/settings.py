@@ -71,9 +71,11 @@ class LearningRates:
     curvature: Rates = Field(default=(2e-3, 2e-4), description="Of the curvatures; 0 leaves every surfel one normal.")
     environment: Rates = Field(default=(6e-2, 5e-3), description="Of the environment's texels.")
     shader: Rates = Field(default=(1e-2, 1e-3), description="Of the network of `shader`.")
-    poses: Rates = Field(default=(1e-3, 5e-5), description="Of the cameras' poses, in radians.")
+    poses: Rates = Field(
+        default=(2e-3, 5e-5), description="Of the cameras' poses: radians that what they show moves by in the picture."
+    )
     intrinsics: Rates = Field(
-        default=(2e-4, 2e-5),
+        default=(5e-5, 5e-6),
         description="Of focal lengths, principal points and distortion, relative to the picture's size.",
     )
     exposure: Rates = Field(default=(2e-2, 1e-3), description="Of the photographs' exposure, natural logarithms of gains.")
@@ -237,7 +239,7 @@ class Settings:
         "path-traced images.",
     )
     cameras_start: float = Field(
-        default=0.05,
+        default=0.1,
         ge=0,
         le=1,
         description="Fraction of the fit from which cameras are learned: at first surfels are too wrong.",
