@@ -1,14 +1,17 @@
 """Small captures of dots at known places, written in every layout: what loads them must find the dots where it says."""
 
+import io
 import json
 import pickle
 import struct
+from dataclasses import replace
 
 import numpy as np
 from PIL import Image
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from rgs_mi.core.camera import Camera
+from rgs_mi.core.camera import Camera, focus_point
 from rgs_mi.core.color import srgb_decode, srgb_encode
 
 SIZE, FOCAL, PRINCIPAL = (120, 96), (100.0, 94.0), (59.0, 49.5)  # neither square pixels nor a central axis
@@ -98,6 +101,45 @@ def write_exr(path, rgb, alpha=None):
 def write_png16(path, grey):
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(grey.astype(np.uint16)).save(path)
+
+
+# ---- As people take them ----
+
+
+def perturbed(dataset, degrees=0.5, position=0.01, focal=0.01, stops=0.3, quality=85, dilation=3, grey=0.5, seed=0):
+    """A path-traced ``dataset`` as if it were photographed, in front of ``grey``, and its cameras estimated: poses off by
+    ``degrees`` and by the part ``position`` of their distance, in random directions, the focal length by the part ``focal``,
+    exposures that differ by up to ``stops``, JPEG's ``quality`` (None: as it is), masks ``dilation`` pixels too large (None:
+    alpha as it is, and no ``grey`` in it). Returns it and {training view's name: log2 of its exposure}, of mean zero."""
+    rng = np.random.default_rng(seed)
+    drawn = rng.uniform(-stops, stops, len(dataset.train))
+    exposures = {view.name: stop - drawn.mean() for view, stop in zip(dataset.train, drawn)}
+    center, _ = focus_point([view.camera for view in dataset.train])
+
+    def direction():
+        drawn = rng.normal(size=3)
+        return drawn / np.linalg.norm(drawn)
+
+    def other(view, stop):
+        to_world = view.camera.to_world.copy()
+        to_world[:3, :3] = to_world[:3, :3] @ Rotation.from_rotvec(np.radians(degrees) * direction()).as_matrix()
+        to_world[:3, 3] += position * np.linalg.norm(view.camera.origin - center) * direction()
+        camera = replace(view.camera, to_world=to_world, focal=tuple(f * (1 + focal) for f in view.camera.focal))
+        linear = srgb_decode(view.pixels[..., :3] / 255) * 2**stop
+        alpha = view.alpha[..., None] if dilation is not None else 1.0
+        shown = np.rint(255 * (srgb_encode(np.clip(linear, 0, 1)) * alpha + grey * (1 - alpha))).astype(np.uint8)
+        if quality is not None:
+            stream = io.BytesIO()
+            Image.fromarray(shown).save(stream, "JPEG", quality=quality)
+            shown = np.asarray(Image.open(stream))
+        mask = view.pixels[..., 3]
+        if dilation is not None:
+            mask = 255 * (ndimage.distance_transform_edt(mask <= 127) <= dilation).astype(np.uint8)
+        return replace(view, camera=camera, pixels=np.concatenate([shown, mask[..., None]], -1))
+
+    train = [other(view, exposures[view.name]) for view in dataset.train]
+    test = [other(view, rng.uniform(-stops, stops)) for view in dataset.test]
+    return replace(dataset, train=train, test=test, photographed=True), exposures
 
 
 # ---- Layouts ----

@@ -31,15 +31,20 @@ def model(seed=0):
     return Model.start(x, x, np.full((300, 3), 0.3), np.full(300, 0.15), np.full((16, 32, 3), 0.5), np.eye(3), 1)
 
 
-def random_photographs() -> Dataset:
-    """Six photographs of random surfels, of odd size and off centre."""
+def photographed() -> tuple[Surfels, Lighting]:
+    """What `random_photographs` show."""
     truth = sphere_surfels(300, seed=2, scale=0.9, opacity_shift=4)
     truth = Surfels.from_numpy(truth.numpy(), two_sided=False)
-    light = model()
+    return truth, Lighting(SplitSum(model().environment().filtered()))
+
+
+def random_photographs(distance=9.0) -> Dataset:
+    """Six photographs of random surfels, of odd size."""
+    truth, lighting = photographed()
     views = []
     for k in range(6):
-        camera = orbit_camera(k, size=(83, 75), distance=9.0)
-        image = deferred.render(truth, camera, Lighting(SplitSum(light.environment().filtered())))
+        camera = orbit_camera(k, size=(83, 75), distance=distance)
+        image = deferred.render(truth, camera, lighting)
         alpha = image.gbuffer.all.alpha.numpy().reshape(75, 83, 1)
         shown = losses.display(image.color, image.gbuffer.all.alpha, 0.0).numpy().T.reshape(75, 83, 3)
         straight = shown / np.maximum(alpha, 1e-3)

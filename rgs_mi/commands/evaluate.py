@@ -19,7 +19,7 @@ from ..evaluation.evaluate import SCORES
 from ..export.mitsuba_scene import SCENE, sensor_id
 from ..fit.curves import Curves
 from ..plugins import lit_surfels
-from ..report import results
+from ..report import cameras, results
 from ..shading.environment import Environment
 
 _FACTS = {
@@ -42,7 +42,7 @@ _FACTS = {
 def reevaluate(run: str | Path, data: str | Path | None = None, quiet: bool = False) -> dict:
     """Measure the run in the folder ``run`` again, and write its metrics.json, pictures of test views, contact sheet and
     report anew. What metrics.json says of the fit stays, and LPIPS where its weights are not installed here; ``evaluated``
-    says where and by what this was measured.
+    says where and by what this was measured. Where the fit learned cameras or exposures, the test views' are fitted again.
 
     Args:
       data: the folder of its photographs (None: where metrics.json says that they were)
@@ -55,8 +55,9 @@ def reevaluate(run: str | Path, data: str | Path | None = None, quiet: bool = Fa
     scene = load_scene(path, {})
     surfels, lighting = lit_surfels(scene, path)
     background, longest = _setting(saved, "background", (0, 1), run), _setting(saved, "resolution", (1, 1 << 16), run)
-    dataset = _photographs(data or saved.get("photographs"), scene, run, int(longest), quiet)
-    mean, scores, rows = results.measure(surfels, lighting, dataset, background, spp_of(scene), run, quiet)
+    folder = data or saved.get("photographs")
+    dataset, registration = _photographs(folder, scene, run, int(longest), quiet)
+    mean, scores, rows, _ = results.measure(surfels, lighting, dataset, background, spp_of(scene), run, quiet, registration)
     if not lpips.installed():
         _keep_lpips(saved, mean, scores)
     now = {"photographs": str(dataset.root.resolve()), "evaluated": results.circumstances()}
@@ -101,19 +102,24 @@ def _setting(saved, name, limits, run) -> float:
 
 
 def _photographs(folder, scene, run, longest, quiet):
-    """The `Dataset`. Raises: UserError where its views are not those of the scene's sensors."""
+    """The `Dataset`, and how its views find their place. Raises: UserError where they are not those of the scene's sensors."""
     if not isinstance(folder, str | Path):
         raise UserError(f"{run / results.METRICS} does not say where the photographs are: give their folder with --data")
     dataset = load_dataset(folder, longest, quiet)
     views, sensors = results.evaluation_views(dataset), scene.sensors()
     same = [sensor_id(view.name) for view in views] == [sensor.id() for sensor in sensors]
-    if not same or not all(map(_sees_the_same, views, sensors)):
+    learned = cameras.read(run, views) if same else None
+    given = [view.camera for view in views]
+    if learned is not None:  # then sensors stand where these views were found to be, not where they were given
+        registration, found = learned
+        same = all(_sees_the_same(registration.cameras[view.name], view.camera) for view in views)
+        given = [found[view.name] for view in views]
+    if not same or not all(_sees_the_same(Camera.from_sensor(s), camera) for s, camera in zip(sensors, given)):
         raise UserError(f"{folder}: its test views are not those of {run}: give the folder of its photographs with --data")
-    return dataset
+    return dataset, learned and registration
 
 
-def _sees_the_same(view, sensor):
-    """Whether a view's camera stands where the sensor does, and has its size."""
-    camera, own = Camera.from_sensor(sensor), view.camera
+def _sees_the_same(camera, own):
+    """Whether a ``camera`` stands where another of its own does, and has its size."""
     scale = max(1.0, np.linalg.norm(own.origin))
-    return camera.size == tuple(own.size) and np.allclose(camera.to_world, own.to_world, atol=1e-4 * scale)
+    return tuple(camera.size) == tuple(own.size) and np.allclose(camera.to_world, own.to_world, atol=1e-4 * scale)

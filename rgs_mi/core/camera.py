@@ -1,19 +1,22 @@
-"""Pinhole cameras: one small value type between data sets, Mitsuba sensors and the splatter.
+"""Cameras: one small value type between data sets, Mitsuba sensors and the splatter.
 
 Frames. World space is whatever the scene uses. Camera space here is the computer-vision one: x right, y down, z along
-the viewing direction, so that depth is z and pixel = focal * (x/z, y/z) + principal point. Mitsuba's own camera space
-(x left, y up, z forward) appears only in `from_sensor` and `to_sensor_dict`.
+the viewing direction, so that depth is z and pixel = focal * (x/z, y/z) + principal point, after what a lens does to
+(x/z, y/z) where there is one. Mitsuba's own camera space (x left, y up, z forward) appears only in `from_sensor` and
+`to_sensor_dict`.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from .errors import UserError
+from .learned_camera import LearnedCamera
+from .lens import Lens
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -23,19 +26,24 @@ _MITSUBA_TO_CV = np.diag([-1.0, -1.0, 1.0, 1.0])
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera.
+    """A pinhole camera, perhaps with a lens.
 
     Attributes
       to_world:  [4, 4] float64, camera space (x right, y down, z forward) to world space, rigid
       focal:     (fx, fy) in pixels
       principal: (cx, cy) in pixels, from the upper left corner of the image; (width/2, height/2) is the centre
       size:      (width, height) in pixels
+      lens:      distortion of the photograph, or None
+      learned:   what a fit has in place of these numbers, or None. Functions on Dr.Jit arrays see it, those on NumPy arrays
+                 do not: see `baked`
     """
 
     to_world: np.ndarray
     focal: tuple[float, float]
     principal: tuple[float, float]
     size: tuple[int, int]
+    lens: Lens | None = None
+    learned: LearnedCamera | None = None
 
     @property
     def origin(self) -> np.ndarray:
@@ -51,7 +59,10 @@ class Camera:
         """Project world ``points`` [N, 3]; return pixels [N, 2] and depths z [N]. Pixels mean nothing where z ≤ 0."""
         p = (np.asarray(points) - self.origin) @ self.rotation.T
         z = p[:, 2]
-        return p[:, :2] / np.where(z == 0, 1e-9, z)[:, None] * self.focal + self.principal, z
+        plane = p[:, :2] / np.where(z == 0, 1e-9, z)[:, None]
+        if self.lens is not None:
+            plane = np.stack(self.lens.distort(*plane.T), -1)
+        return plane * self.focal + self.principal, z
 
     def image_plane(self) -> tuple[np.ndarray, np.ndarray]:
         """Return x/z and y/z, each [H, W], of the camera-space rays through the pixel centers."""
@@ -59,7 +70,7 @@ class Camera:
         x = (np.arange(width) + 0.5 - self.principal[0]) / self.focal[0]
         y = (np.arange(height) + 0.5 - self.principal[1]) / self.focal[1]
         x, y = np.meshgrid(x, y)
-        return x, y
+        return (x, y) if self.lens is None else self.lens.undistort(x, y)
 
     def rays(self) -> np.ndarray:
         """Return the world-space rays through the pixel centers, [H, W, 3], of unit camera-space z: origin + depth · ray is
@@ -86,6 +97,18 @@ class Camera:
     def cropped(self, x: int, y: int, width: int, height: int) -> "Camera":
         """Return the same camera, restricted to the window of ``width`` × ``height`` pixels whose corner is pixel (x, y)."""
         return replace(self, principal=(self.principal[0] - x, self.principal[1] - y), size=(width, height))
+
+    def baked(self) -> "Camera":
+        """Return the same camera with numbers in place of what was ``learned``."""
+        if self.learned is None:
+            return self
+        rotation, origin, zoom, shift, lens = np.split(self.learned.values.numpy().astype(np.float64), [9, 12, 14, 16])
+        u, _, vh = np.linalg.svd(rotation.reshape(3, 3))  # single precision leaves it a ten-millionth short of rigid
+        to_world = np.eye(4)
+        to_world[:3, :3], to_world[:3, 3] = (u @ vh).T, origin
+        (fx, fy), principal = zoom * self.focal, self.principal + shift * self.focal
+        lens = Lens(*lens.tolist(), self.learned.reach)
+        return Camera(to_world, (float(fx), float(fy)), (float(principal[0]), float(principal[1])), self.size, lens)
 
     @classmethod
     def look_at(
@@ -127,7 +150,7 @@ class Camera:
 
     def to_sensor_dict(self) -> dict:
         """Return a Mitsuba `perspective` sensor (as for ``mi.load_dict``) with this camera's view, whose pixels must be
-        square."""
+        square. It has no lens."""
         import mitsuba as mi
 
         width, height = self.size
@@ -145,30 +168,49 @@ class Camera:
 # ---- On Dr.Jit arrays ----
 
 
-def opaque(camera: Camera) -> tuple["mi.Matrix3f", "mi.Point3f", "mi.Vector2f", "mi.Vector2f"]:
-    """Return the camera's numbers as opaque Dr.Jit values (literals would recompile the kernels at every pose): rotation
-    (world to camera), origin (world space), focal length and principal point (pixels)."""
+class Projection(NamedTuple):
+    """A camera as kernels see it: ``rotation`` (world to camera), ``origin`` (world space), ``focal`` length and ``principal``
+    point (pixels), Dr.Jit values, and the ``lens``, None for a pinhole's."""
+
+    rotation: "mi.Matrix3f"
+    origin: "mi.Point3f"
+    focal: "mi.Vector2f"
+    principal: "mi.Vector2f"
+    lens: Lens | None
+
+
+def opaque(camera: Camera, width: int = 1) -> Projection:
+    """Return the camera's numbers as opaque Dr.Jit values (literals would recompile the kernels at every pose), and what is
+    learned of it in their place, differentiable; that is of the ``width`` of what the kernel works on."""
     import drjit as dr
     import mitsuba as mi
 
     scalar = lambda v: dr.opaque(mi.Float, float(v))
-    return (
+    focal, principal = mi.Vector2f(*map(scalar, camera.focal)), mi.Vector2f(*map(scalar, camera.principal))
+    if camera.learned is not None:
+        rotation, origin, zoom, shift, lens = camera.learned.numbers(width)
+        return Projection(rotation, origin, focal * zoom, principal + focal * shift, lens)
+    return Projection(
         mi.Matrix3f([[scalar(v) for v in row] for row in camera.rotation]),
         mi.Point3f(*map(scalar, camera.origin)),
-        mi.Vector2f(*map(scalar, camera.focal)),
-        mi.Vector2f(*map(scalar, camera.principal)),
+        focal,
+        principal,
+        camera.lens and Lens(*map(scalar, camera.lens.coefficients), scalar(camera.lens.reach)),
     )
 
 
 def pixel_rays(camera: Camera, index: "mi.UInt32") -> "mi.Vector3f":
     """Return the world-space rays through the centers of the pixels ``index`` (row-major), of unit camera-space z; see
     `Camera.rays`, their twin on NumPy arrays."""
+    import drjit as dr
     import mitsuba as mi
 
-    R, _, f, principal = opaque(camera)
+    R, _, f, principal, lens = opaque(camera, dr.width(index))
     width = camera.size[0]
     x = (mi.Float(index % width) + 0.5 - principal.x) / f.x
     y = (mi.Float(index // width) + 0.5 - principal.y) / f.y
+    if lens is not None:
+        x, y = lens.undistort(x, y)
     return R.T @ mi.Vector3f(x, y, 1)
 
 

@@ -49,7 +49,8 @@ def load(root: Path, longest: int = LONGEST) -> Dataset:
     frames = [_frame(file, meta, index, longest) for index in range(len(meta["frames"]))]
     kept, held_out = _split(file, meta, frames)
     points, colors = _points(file, meta) or (None, None)
-    return Dataset(**load_split(file, kept, held_out, longest), points=points, point_colors=colors, root=root)
+    views = load_split(file, kept, held_out, longest)
+    return Dataset(**views, points=points, point_colors=colors, root=root, photographed=True)
 
 
 def _frame(file: Path, meta: dict, index: int, longest: int) -> Frame:

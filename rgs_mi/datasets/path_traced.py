@@ -140,12 +140,12 @@ class Renderer:
         index = dr.arange(mi.UInt32, width * height * n * n)
         pixel, sub = index // (n * n), index % (n * n)
         column, row = pixel % width * n + sub % n, pixel // width * n + sub // n
-        rotation, origin, *_ = opaque(camera)
-        ray = mi.Ray3f(origin, pixel_directions(fine, row * (n * width) + column))
+        seen = opaque(camera)
+        ray = mi.Ray3f(seen.origin, pixel_directions(fine, row * (n * width) + column))
         si = self.scene.ray_intersect(ray)
         hit, bsdf = si.is_valid(), si.bsdf(ray)
         normal = dr.select(dr.dot(si.n, ray.d) > 0, -si.sh_frame.n, si.sh_frame.n)
-        depth = si.t * (rotation @ ray.d).z
+        depth = si.t * (seen.rotation @ ray.d).z
         albedo = bsdf.eval_diffuse_reflectance(si, hit)
         scalars = [
             dr.select(bsdf.has_attribute(k, hit), bsdf.eval_attribute_1(k, si, hit), 0) for k in ("roughness", "metallic")

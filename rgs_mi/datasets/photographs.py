@@ -77,7 +77,7 @@ class Photographs:
     def _whole(self, i):
         """[H, W, 4 or 5] of this level: colour, coverage and, where there is one, the prior."""
         view = self.views[i]
-        whole = _shrink(np.concatenate([display(view.pixels, 0.0), view.alpha[..., None]], 2), self.downscale)
+        whole = shrink(np.concatenate([display(view.pixels, 0.0), view.alpha[..., None]], 2), self.downscale)
         if self.priors is None:
             return whole
         return np.concatenate([whole, resize(self.priors[i].values, *whole.shape[:2])[..., None]], 2)
@@ -99,8 +99,9 @@ def _windows(views, downscale):
     return [(int(x), int(y), int(size[0]), int(size[1])) for x, y in corners]
 
 
-def _shrink(image, factor):
-    """Mean over factor × factor blocks; the last rows and columns that fill no block are left out."""
+def shrink(image: np.ndarray, factor: int) -> np.ndarray:
+    """Return an ``image`` [H, W, channels] as means over factor × factor blocks; the last rows and columns that fill no block
+    are left out, and an image smaller than a block stays as it is."""
     if factor == 1 or min(image.shape[:2]) < factor:
         return image
     height, width = (n - n % factor for n in image.shape[:2])

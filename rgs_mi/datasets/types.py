@@ -42,13 +42,15 @@ class View:
 class Dataset:
     """A capture in the folder ``root``. ``train`` is fitted, ``test`` is held out (and only ever looked at); ``points`` are
     world-space positions [N, 3] and ``point_colors`` linear colours [N, 3] of a sparse reconstruction where the layout has
-    one."""
+    one. ``photographed`` says whether the images are photographs, whose cameras and exposures someone has estimated, or
+    path-traced ones, whose are known."""
 
     train: list[View]
     test: list[View]
     points: np.ndarray | None = None
     point_colors: np.ndarray | None = None
     root: Path = field(default_factory=Path)
+    photographed: bool = False
 
 
 @dataclass(frozen=True)

@@ -37,10 +37,17 @@ class Rendering:
     maps: dict[str, np.ndarray]
 
 
-def render_view(surfels: Surfels, lighting: Lighting | None, camera: Camera, background: float, spp: int = 1) -> Rendering:
+def render_view(
+    surfels: Surfels,
+    lighting: Lighting | None,
+    camera: Camera,
+    background: float,
+    spp: int = 1,
+    gain: np.ndarray | None = None,
+) -> Rendering:
     """Render ``surfels`` under ``lighting`` (None: diffuse only) over the display-space grey level ``background``, with
     ``spp`` samples per pixel, rounded up to a square: linear radiance and all maps are means over a grid, as those of
-    'rgs_deferred'."""
+    'rgs_deferred'. The image, but no map, is exposed with ``gain`` [3]."""
     (width, height), (fine, side) = camera.size, camera.subdivided(spp)
     with dr.suspend_grad():
         image = deferred.render(surfels, fine, lighting)
@@ -64,7 +71,8 @@ def render_view(surfels: Surfels, lighting: Lighting | None, camera: Camera, bac
         alpha = means.pop("alpha")
         length = np.linalg.norm(means["sh_normal"], axis=-1, keepdims=True)
         means["sh_normal"] *= alpha / np.where(length > 0, length, 1)
-        color = mi.Color3f(*(as_float(means["color"][..., k]) for k in range(3)))
+        exposed = means["color"] if gain is None else means["color"] * gain
+        color = mi.Color3f(*(as_float(exposed[..., k]) for k in range(3)))
         shown = losses.display(color, as_float(alpha), background).numpy().T.reshape(height, width, 3)
     return Rendering(np.clip(shown, 0, 1), alpha, means)
 

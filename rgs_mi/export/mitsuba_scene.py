@@ -20,6 +20,7 @@ from ..surfels.surfels import Surfels
 if TYPE_CHECKING:
     from ..fit.scene import FitScene
 
+_SQUARE = 2e-3  # a pixel in five hundred is no ground to warn: focal lengths that are learned come out as different
 SURFELS, ENVIRONMENT, SHADER, SCENE = "object.ply", "environment.exr", "shader.npz", "scene.xml"
 
 
@@ -58,7 +59,7 @@ def export(
             "box": shading.box,
         },
     )
-    if any(abs(v.camera.focal[0] / v.camera.focal[1] - 1) > 1e-4 for v in views):
+    if any(abs(v.camera.focal[0] / v.camera.focal[1] - 1) > _SQUARE for v in views):
         warnings.warn(f"{folder / SCENE}: the cameras' pixels are not square, those of its sensors are", stacklevel=2)
     root.extend(_sensor(view, spp) for view in views)
     ET.indent(root, "    ")

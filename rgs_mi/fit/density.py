@@ -51,7 +51,7 @@ class DensityControl:
         """Remember what is reflective in the view of this index, where that guides density control; ``mask`` is its β̂,
         [H, W] bool."""
         if self.settings.guided:
-            self.reflective[view] = camera, boxes(mask)
+            self.reflective[view] = camera.baked(), boxes(mask)
 
     def guided(self, model: Model) -> np.ndarray | None:
         """Return [N] which surfels get half the threshold (RGS, Algorithm 1); None where nothing guides."""

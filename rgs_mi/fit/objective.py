@@ -42,14 +42,23 @@ class Objective:
         w = self.settings.weights
         return max(w.distortion, w.delta_normal) > 0
 
-    def __call__(self, image: deferred.Image, photo: Photograph, masked: bool, consistency: float, step: int) -> ViewLoss:
+    def __call__(
+        self,
+        image: deferred.Image,
+        photo: Photograph,
+        masked: bool,
+        consistency: float,
+        step: int,
+        gain: "mi.Color3f | None" = None,
+    ) -> ViewLoss:
         """Return the losses of ``image``, a rendering of the view of ``photo``, which has a mask where ``masked``.
 
         ``consistency`` is the weight of depth-normal consistency by now; ``step`` decides which quarter of the pixels
-        minimum variation looks at.
+        minimum variation looks at; ``gain`` is the photograph's exposure, by which linear radiance is multiplied.
         """
         w, maps, size = self.settings.weights, image.gbuffer.all, photo.camera.size
-        rendered = losses.display(image.color, maps.alpha, self.settings.background)
+        color = image.color if gain is None else image.color * gain
+        rendered = losses.display(color, maps.alpha, self.settings.background)
         terms = {"photometric": losses.photometric(rendered, photo.color, size, w.dssim)}
         if w.mask > 0 and masked:
             terms["mask"] = w.mask * losses.mask(maps.alpha, photo.alpha)

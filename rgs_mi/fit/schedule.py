@@ -91,10 +91,25 @@ class Schedule:
         # A light that has no shape yet would turn normals that the hull has right. Two-sided surfels began at random.
         if progress < s.normals_start and not two_sided:
             rates |= {name: _HELD * rates[name] for name in _NORMALS}
-        # Adam's steps are as long as its rates, however little there is to gain: what is right trembles to the last
-        if progress > 1 - s.cooldown:
-            rates = {name: rate * (1 - progress) / s.cooldown for name, rate in rates.items()}
-        return rates
+        return {name: rate * self._cooled(progress) for name, rate in rates.items()}
+
+    def camera_rates(self, progress: float) -> dict[str, float]:
+        """Adam's rate of each kind of `fit.cameras.Cameras.rows`."""
+        rates = self.settings.learning_rates
+        return {
+            name: self.value(getattr(rates, name), progress) * self._cooled(progress)
+            for name in ("poses", "intrinsics", "exposure")
+        }
+
+    def _cooled(self, progress):
+        """The part that rates have of themselves in the end. Adam's steps are as long as its rates, however little there is to
+        gain: what is right trembles to the last."""
+        s = self.settings
+        return (1 - progress) / s.cooldown if progress > 1 - s.cooldown else 1.0
+
+    def learns_cameras(self, progress: float) -> bool:
+        """Whether cameras that are learned have begun to move."""
+        return progress >= self.settings.cameras_start
 
     def envmap_height(self, progress: float, height: int, width: int) -> int:
         """Rows that an environment of ``height`` rows should have by then: twice as many, and twice again, up to

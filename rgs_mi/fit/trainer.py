@@ -16,6 +16,7 @@ from ..shading.lighting import Lighting, Shading, lighting_of
 from ..surfels.proxies import Proxies
 from ..surfels.surfels import CHANNELS, Surfels
 from . import losses, reflection_guided
+from .cameras import Cameras
 from .curves import Curves
 from .density import DensityControl
 from .model import ENVIRONMENT, Model
@@ -31,7 +32,8 @@ class Fit:
 
     ``extent``: radius of the object in world units. ``shading``: how the scene is shaded. ``priors``: a `DepthPrior` for
     each training view, or None. ``elapsed``: seconds spent so far, earlier sessions included; ``psnr``: of the last step's
-    views, NaN once the fit has diverged; ``curves``: what its steps measured.
+    views, NaN once the fit has diverged; ``cameras``: what is learned of cameras and exposures, or None; ``curves``: what its
+    steps measured.
     """
 
     def __init__(
@@ -47,6 +49,7 @@ class Fit:
         self.schedule = Schedule.of(settings, shading)
         self.objective = Objective(settings, extent, shading.box)
         self.density = DensityControl(settings.density, extent, shading.box, len(model))
+        self.cameras = Cameras.of(dataset, settings, extent)
         self.curves = Curves()
         self.photographs: Photographs | None = None  # of the stage that has begun
         self.step_number, self.views_used, self.elapsed = 0, 0, 0.0
@@ -63,6 +66,8 @@ class Fit:
         gradients = self.density.gradients
         arrays = {"gradient_sum": gradients.sum.numpy(), "gradient_count": gradients.count.numpy()}
         meta = {"step": self.step_number, "views_used": self.views_used, "elapsed": self.elapsed, "extent": self.extent}
+        if self.cameras:
+            arrays |= self.cameras.state()
         return self.model.state() | arrays, meta | {"curves": self.curves.rows}
 
     @classmethod
@@ -72,6 +77,8 @@ class Fit:
         fit.step_number, fit.views_used, fit.elapsed = meta["step"], meta["views_used"], meta["elapsed"]
         gradients = fit.density.gradients
         gradients.sum, gradients.count = (as_float(arrays[f"gradient_{k}"]) for k in ("sum", "count"))
+        if fit.cameras:
+            fit.cameras.restore(arrays)
         fit.curves = Curves(meta["curves"])
         return fit
 
@@ -150,6 +157,8 @@ class Fit:
             dr.backward(loss)
             measured.append({"loss.environment_tv": dr.detach(loss)})
         self.model.optimizer.step()
+        if self.cameras:
+            self.cameras.step(self.schedule.camera_rates(progress))
         dr.eval(measured)
         mean = {name: np.mean([float(m[name][0]) for m in measured if name in m]) for m in measured for name in m}
         self._judge(mean.pop("error"))
@@ -199,17 +208,22 @@ class Fit:
     def _view(self, i, surfels, lighting, weight):
         """Accumulate the gradients of view ``i``; returns its loss's terms and the mean squared ``error``."""
         assert self.photographs is not None
-        photo = self.photographs[i]
+        photo, gain, terms = self.photographs[i], None, {}
+        if self.cameras:
+            started = self.schedule.learns_cameras(self.progress)
+            seen = self.cameras.see(i, photo.camera, self.settings.weights, started)
+            photo, gain, terms = replace(photo, camera=seen.camera), seen.gain, {"loss.cameras": seen.prior}
         means2d_offset = dr.zeros(mi.Vector2f, len(self.model))
         dr.enable_grad(means2d_offset)
         image = deferred.render(surfels, photo.camera, lighting, means2d_offset, full=self.objective.full)
         consistency = self.schedule.value(self.settings.weights.consistency, self.progress)
-        loss = self.objective(image, photo, self.dataset.train[i].masked, consistency, self.step_number)
-        dr.backward(sum(loss.terms.values()) * weight)
+        loss = self.objective(image, photo, self.dataset.train[i].masked, consistency, self.step_number, gain)
+        terms |= loss.terms
+        dr.backward(sum(terms.values()) * weight)
         self.density.gradients.add(dr.grad(means2d_offset) / weight, image.gbuffer.seen, photo.size)
         if loss.reflective is not None:
             self.density.note_reflective(i, photo.camera, loss.reflective)
-        return dr.detach(loss.terms) | {"error": loss.error}
+        return dr.detach(terms) | {"error": loss.error}
 
     def _judge(self, error):
         """Note the step's mean squared error. One that is not a number is an overflow in some pixel; when it stays, the fit

@@ -282,7 +282,7 @@ def depth_maps(vertices: np.ndarray, faces: np.ndarray, cameras: Sequence[Camera
     for camera in cameras:
         width, height = camera.size
         rays = pixel_rays(camera, dr.arange(mi.UInt32, width * height))
-        ray = mi.Ray3f(opaque(camera)[1], rays)  # unit z: the ray parameter is the depth
+        ray = mi.Ray3f(opaque(camera).origin, rays)  # unit z: the ray parameter is the depth
         t = np.array(scene.ray_intersect_preliminary(ray, coherent=True).t).reshape(height, width)
         depths.append(np.where(np.isfinite(t), t, np.float32(np.nan)))
     return depths

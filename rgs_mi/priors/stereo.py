@@ -205,6 +205,7 @@ def sweep(
     return np.stack([score.numpy().reshape(height, width) for score in scores])
 
 
+<<<<<<< HEAD
 def _warp(point, other, image, surface, margin):
     """(values of the ``other`` view's ``image`` at ``point``, whether that can be its surface: in its frame, not above its
     hull)."""
@@ -214,6 +215,28 @@ def _warp(point, other, image, surface, margin):
     local = rotation @ mi.Vector3f(point - origin)
     x = local.x / local.z * focal.x + principal.x - 0.5
     y = local.y / local.z * focal.y + principal.y - 0.5
+=======
+def _points(camera, depth, level):
+    """World points below the hull, one entry per level and pixel."""
+    filled = np.where(np.isfinite(depth), depth, np.nanmax(depth))
+    entry, n = dr.arange(mi.UInt32, filled.size * len(level)), dr.opaque(mi.UInt32, filled.size)
+    pixel = entry % n
+    z = dr.gather(mi.Float, as_float(filled), pixel) + dr.gather(mi.Float, as_float(level), entry // n)
+    point = opaque(camera).origin + pixel_rays(camera, pixel) * z
+    dr.eval(point)
+    return point
+
+
+def _warp(points, other, depth, margin):
+    """(grey levels of the ``other`` photograph at ``points``, whether these can be its surface: in its frame, not above its
+    hull)."""
+    constant = lambda x: dr.opaque(mi.Float, float(x))
+    seen = opaque(other.camera)
+    width, height = other.camera.size
+    local = seen.rotation @ mi.Vector3f(points - seen.origin)
+    x = local.x / local.z * seen.focal.x + seen.principal.x - 0.5
+    y = local.y / local.z * seen.focal.y + seen.principal.y - 0.5
+>>>>>>> cameras
     inside = (local.z > 0) & (x >= 0) & (y >= 0) & (x < constant(width - 1)) & (y < constant(height - 1))
     column, row = dr.floor(x), dr.floor(y)
     at = mi.UInt32(dr.select(inside, row * constant(width) + column, 0))

@@ -21,6 +21,7 @@ class Figure:
 #: Name in metrics.json -> how it is written.
 FIGURES = {
     "psnr": Figure("PSNR", 2, 2, "dB"),
+    "psnr_unaligned": Figure("PSNR, unaligned", 2, 2, "dB"),
     "ssim": Figure("SSIM", 4, 3),
     "lpips": Figure("LPIPS", 4, 3),
     "lpips_alex": Figure("LPIPS (AlexNet)", 4, 3),

@@ -5,6 +5,7 @@ import platform
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,19 +18,22 @@ from ..core.files import write_json, write_png
 from ..core.progress import Progress
 from ..core.runtime import cores, peak_rss_mb
 from ..datasets.types import Dataset, View
-from ..evaluation import evaluate, lpips, pictures
+from ..evaluation import evaluate, lpips, metrics, pictures
+from ..evaluation.registration import Registered, Registration, register
 from ..export.mitsuba_scene import export
 from ..fit.curves import Curves
 from ..settings.config import to_dict
 from ..shading.environment import Environment
 from ..shading.lighting import Lighting
 from ..surfels.surfels import Surfels
+from . import cameras
 from .figures import label, text
 
 if TYPE_CHECKING:
     from ..fit.scene import FitScene
     from ..fit.trainer import Fit
 
+UNALIGNED = "psnr_unaligned"  # PSNR with poses and exposures as they were given
 METRICS, SHEET, GUIDED = "metrics.json", "contact_sheet.png", "guided.png"
 PREVIEWS = 4  # test views on the sheet and in the report, and with their G-buffers written
 _SUMMARY = ("psnr", "ssim", "lpips", "normal_mae_deg", "surfels", "iterations", "train_seconds", "render_fps")
@@ -46,18 +50,26 @@ def write(fit: "Fit", scene: "FitScene", folder: Path, quiet: bool) -> None:
     facts = _facts(fit)  # the peak of memory is the fit's, not that of its evaluation
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
-        exported = export(
-            folder,
-            scene,
-            surfels,
-            environment,
-            fit.shading,
-            fit.model.shader(),
-            evaluation_views(fit.dataset),
-            fit.settings.spp,
-        )
         lighting = fit.lighting(surfels)
-    mean, scores, rows = measure(surfels, lighting, fit.dataset, fit.settings.background, fit.settings.spp, folder, quiet)
+    views = evaluation_views(fit.dataset)
+    registration = cameras.registration(fit.cameras, views)
+    settings = fit.settings
+    mean, scores, rows, found = measure(
+        surfels, lighting, fit.dataset, settings.background, settings.spp, folder, quiet, registration
+    )
+    exported = export(
+        folder,
+        scene,
+        surfels,
+        environment,
+        fit.shading,
+        fit.model.shader(),
+        [replace(view, camera=found[view.name].camera) for view in views],
+        settings.spp,
+    )
+    if fit.cameras:
+        exported.append(cameras.write(folder, fit.cameras, fit.dataset, views, found))
+        facts["cameras"] = cameras.summary(fit.cameras)
     if (guided := fit.guided_picture()) is not None:
         write_png(folder / GUIDED, guided / 255)
     fit.curves.write(folder)
@@ -72,21 +84,29 @@ def measure(
     spp: int,
     folder: Path,
     quiet: bool,
-) -> tuple[dict, dict, dict]:
+    registration: Registration | None = None,
+) -> tuple[dict, dict, dict, dict[str, Registered]]:
     """Render the evaluation views of ``dataset``, and write their pictures below ``folder``.
 
-    Args: see `evaluate.render_view`.
-    Returns: the figures of quality and speed, means as metrics.json has them; its ``views``, {name: scores}; and
-    {name: `pictures.panels`} of the preview views.
+    Args: see `evaluate.render_view`. ``registration``: which of their poses and exposures are fitted first; None: none.
+    Returns: the figures of quality and speed, means as metrics.json has them; its ``views``, {name: scores};
+    {name: `pictures.panels`} of the preview views; and {name: how each was seen}.
     Raises: UserError where the disk is full or the folder can't be written.
     """
-    views, scores, rows = evaluation_views(dataset), {}, {}
+    views, scores, rows, found = evaluation_views(dataset), {}, {}, {}
     on_sheet = {view.name for view in preview_views(views)}
     with Progress(None, quiet, "evaluating") as progress:
         for k, view in enumerate(views):
-            rendering = evaluate.render_view(surfels, lighting, view.camera, background, spp)
+            seen = found[view.name] = Registered(view.camera)
+            if registration is not None:
+                start = registration.cameras.get(view.name, view.camera)
+                unaligned = evaluate.render_view(surfels, lighting, start, background, spp)
+                seen = found[view.name] = register(registration, surfels, lighting, view, background)
+            rendering = evaluate.render_view(surfels, lighting, seen.camera, background, spp, seen.gain)
             pictures.write_view(folder / "test", view, rendering, background, gbuffer=view.name in on_sheet)
             scores[view.name] = evaluate.score(view, rendering, background)
+            if registration is not None:
+                scores[view.name][UNALIGNED] = metrics.psnr(unaligned.image, evaluate.ground_truth(view, background))
             if view.name in on_sheet:
                 rows[view.name] = pictures.panels(view, rendering, background)
             progress.update((k + 1) / len(views))
@@ -97,7 +117,11 @@ def measure(
     if mean["lpips"] is None:
         reason = _TOO_SMALL if lpips.installed() else _NO_LPIPS
     fps = evaluate.frames_per_second(surfels, lighting, [view.camera for view in views], spp)
-    return mean | {"lpips_reason": reason, "render_fps": fps}, scores, rows
+    mean |= {"lpips_reason": reason, "render_fps": fps}
+    if registration is not None:
+        mean |= {"test_cameras": registration.words}
+        mean |= {UNALIGNED: float(np.mean([s[UNALIGNED] for s in scores.values()])) if scores else None}
+    return mean, scores, rows, found
 
 
 def publish(

@@ -13,7 +13,7 @@ from ..evaluation.pictures import ERROR_RANGE, NORMAL_RANGE
 from ..fit.curves import Curves
 from ..settings.config import to_dict
 from ..settings.settings import Settings
-from . import html
+from . import cameras, html
 from .plots import curves as plot
 
 REPORT = "report.html"
@@ -55,6 +55,7 @@ def write(
         views=[_view(name, panels, figures["views"].get(name, {})) for name, panels in rows.items()],
         scales=_SCALES,
         environment=html.hdr(_shrunk(environment), _ENVIRONMENT_WORDS),
+        cameras=cameras.rows(figures.get("cameras", {})),
         scores=[name for name in SCORES if figures[name] is not None],
         settings=list(_lines(figures["settings"], to_dict(Settings()))),
         files=_FILES,

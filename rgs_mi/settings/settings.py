@@ -75,6 +75,14 @@ class LearningRates:
     curvature: Rates = Field(default=(2e-3, 2e-4), description="Of the curvatures; 0 leaves every surfel one normal.")
     environment: Rates = Field(default=(6e-2, 5e-3), description="Of the environment's texels.")
     shader: Rates = Field(default=(1e-2, 1e-3), description="Of the network of `shader`.")
+    poses: Rates = Field(
+        default=(2e-3, 5e-5), description="Of the cameras' poses: radians that what they show moves by in the picture."
+    )
+    intrinsics: Rates = Field(
+        default=(5e-5, 5e-6),
+        description="Of focal lengths, principal points and distortion, relative to the picture's size.",
+    )
+    exposure: Rates = Field(default=(2e-2, 1e-3), description="Of the photographs' exposure, natural logarithms of gains.")
 
 
 @dataclass(frozen=True, config=_MODEL)
@@ -109,6 +117,12 @@ class Weights:
         ge=0,
         le=1e3,
         description="Total variation of the environment: what nothing reflects sharply stays smooth.",
+    )
+    poses: float = Field(
+        default=0.1, ge=0, le=1e6, description="Squared distance of learned poses from the given ones, in radians."
+    )
+    intrinsics: float = Field(
+        default=0.1, ge=0, le=1e6, description="Squared distance of learned intrinsics from the given ones, relative."
     )
 
 
@@ -228,6 +242,21 @@ class Settings:
     sh_order: int = Field(default=2, ge=0, le=3, description="Order of the spherical harmonics of the diffuse radiance.")
     sh_start: float = Field(
         default=0.4, ge=0, le=1, description="Fraction of the fit from which view-dependent diffuse is learned."
+    )
+    cameras: Literal["auto", "fixed", "learned"] = Field(
+        default="auto",
+        description="Whether poses, focal lengths, principal points and distortion are learned; `auto`: of photographs, not of "
+        "path-traced images.",
+    )
+    cameras_start: float = Field(
+        default=0.1,
+        ge=0,
+        le=1,
+        description="Fraction of the fit from which cameras are learned: at first surfels are too wrong.",
+    )
+    exposure: Literal["auto", "fixed", "learned"] = Field(
+        default="auto",
+        description="Whether exposure and white balance of each photograph are learned; `auto` as for `cameras`.",
     )
     checkpoint_seconds: float = Field(default=20.0, ge=0, le=1e6, description="Seconds from one checkpoint to the next.")
     stages: tuple[Stage, ...] = Field(

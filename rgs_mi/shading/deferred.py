@@ -47,8 +47,8 @@ def within(gbuffer: GBuffer, camera: Camera, box: BoundingBox | None) -> "mi.Boo
 
 def _points(camera, direction, depth):
     """World-space points along unit ``direction`` at a ``depth`` (z)."""
-    rotation, origin, *_ = opaque(camera)
-    return origin + direction * (depth / (rotation @ direction).z)
+    seen = opaque(camera, dr.width(direction))
+    return seen.origin + direction * (depth / (seen.rotation @ direction).z)
 
 
 def _reflected(gbuffer, camera, lighting):

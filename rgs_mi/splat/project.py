@@ -8,6 +8,9 @@ offset from the projected center. The pixel's ray meets the surfel's plane at
 
 where t is the hit's depth and (u, v) its position in standard deviations. So a surfel is ten numbers, exact in
 perspective, free of cancellation near its center, and no ray direction is needed in the inner loop.
+
+A lens (`core.lens`) moves the projected center, and its Jacobian J there takes the δ of a pinhole to that of the photograph:
+J⁻¹ stands before δ/f in (1). That is exact at the center and linear about it.
 """
 
 from dataclasses import dataclass
@@ -51,7 +54,7 @@ def project(surfels: "Surfels", camera: Camera, means2d_offset: "mi.Vector2f | N
     ``means2d_offset`` (pixels, width N) is added to the projected centers: zeros with gradients enabled obtain the gradient
     on the image plane that density control accumulates.
     """
-    R, origin, f, principal = opaque(camera)
+    R, origin, f, principal, lens = opaque(camera, len(surfels))
     offset = surfels.column(mi.Vector3f, "centers") - origin
     p = R @ offset
     t_u, t_v, n_world = surfels.frames()
@@ -60,8 +63,11 @@ def project(surfels: "Surfels", camera: Camera, means2d_offset: "mi.Vector2f | N
 
     visible = p.z > NEAR
     z = dr.select(visible, p.z, 1)
-    x = p.x / z * f.x + principal.x
-    y = p.y / z * f.y + principal.y
+    x, y = p.x / z, p.y / z
+    per_pixel = _per_pixel(f, lens, x, y)
+    if lens is not None:
+        x, y = lens.distort(x, y)
+    x, y = x * f.x + principal.x, y * f.y + principal.y
     if means2d_offset is not None:
         x, y = x + means2d_offset.x, y + means2d_offset.y
 
@@ -71,9 +77,9 @@ def project(surfels: "Surfels", camera: Camera, means2d_offset: "mi.Vector2f | N
         visible &= facing < 0
     least = EDGE_ON * dr.detach(distance)
     facing_safe = dr.select(dr.abs(facing) < least, dr.copysign(least, facing), facing)
-    N = mi.Vector2f(n.x / f.x, n.y / f.y) * (z / facing_safe)
-    A = mi.Vector2f(a.x / f.x, a.y / f.y) * z - dr.dot(p, a) * N
-    B = mi.Vector2f(b.x / f.x, b.y / f.y) * z - dr.dot(p, b) * N
+    N = per_pixel(n) * (z / facing_safe)
+    A = per_pixel(a) * z - dr.dot(p, a) * N
+    B = per_pixel(b) * z - dr.dot(p, b) * N
     opacity = surfels.column(mi.Float, "opacities")
     turned = lambda v: dr.select(facing > 0, -v, v)
     dn_du, dn_dv = surfels.normal_derivatives()
@@ -84,3 +90,12 @@ def project(surfels: "Surfels", camera: Camera, means2d_offset: "mi.Vector2f | N
         (turned(dn_du), turned(dn_dv)),
         visible,
     )
+
+
+def _per_pixel(f, lens, x, y):
+    """The function that takes a vector v to v_xy J⁻¹/f of (1), with J the Jacobian of the ``lens`` at (x, y) (symmetric)."""
+    if lens is None:
+        return lambda v: mi.Vector2f(v.x / f.x, v.y / f.y)
+    xx, xy, yy = lens.jacobian(x, y)
+    inverse = dr.rcp(xx * yy - xy * xy)
+    return lambda v: mi.Vector2f((yy * v.x - xy * v.y) * inverse / f.x, (xx * v.y - xy * v.x) * inverse / f.y)

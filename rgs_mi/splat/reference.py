@@ -1,8 +1,9 @@
 """The splatter's slow, readable twin: every surfel against every pixel. The oracle of the tests.
 
 It shares no formula with the tiled one: rays are intersected with planes in world space, nothing is projected but the
-center, no lists are formed, and Dr.Jit differentiates it. So it also goes from pixels to rays in NumPy, not by
-`core.camera.pixel_rays`. For scenes of some hundred surfels: all pairs are in memory.
+center, no lists are formed, and Dr.Jit differentiates it. So it also goes from pixels to rays by itself, not by
+`core.camera.pixel_rays`. Of a lens it takes the Jacobian at each center by differences, and turns each pixel's ray to where
+the lens, linear about the center, has it. For scenes of some hundred surfels: all pairs are in memory.
 """
 
 from typing import TYPE_CHECKING
@@ -11,7 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.camera import Camera
+from ..core.camera import Camera, opaque
 from .gbuffer import Maps
 from .project import NEAR
 from .tiles import BLOCK, LOW_PASS, Cutoffs
@@ -19,21 +20,38 @@ from .tiles import BLOCK, LOW_PASS, Cutoffs
 if TYPE_CHECKING:
     from ..surfels.surfels import Surfels
 
+_STEP = 0.005  # x/z units, from point to point of central differences
+
+
+def _about(lens, x, y, dx, dy):
+    """The pinhole's (x, y) for what a ``lens``, linear about (x, y), shows (dx, dy) beside that point's image."""
+    if lens is None:
+        return x + dx, y + dy
+    columns = [
+        [(b - a) / (2 * _STEP) for a, b in zip(lens.distort(x - i, y - j), lens.distort(x + i, y + j))]
+        for i, j in ((_STEP, 0), (0, _STEP))
+    ]
+    (xx, yx), (xy, yy) = columns
+    inverse = 1 / (xx * yy - xy * yx)
+    return x + (yy * dx - xy * dy) * inverse, y + (xx * dy - yx * dx) * inverse
+
 
 def _front_to_back(surfels, camera) -> np.ndarray:
     """[pixels, N] indices of the surfels in front of the camera, by the depth at which the ray through the middle of the
     pixel's block meets them."""
-    width, height = camera.size
+    (width, height), camera = camera.size, camera.baked()
     fields = {name: value.astype(np.float64) for name, value in surfels.numpy().items()}
     center = (fields["centers"] - camera.origin) @ camera.rotation.T
     front = np.flatnonzero(center[:, 2] > NEAR)
     center, scales = center[front], fields["scales"][front]
     t_u, t_v, normal = (v.numpy().T[front].astype(np.float64) @ camera.rotation.T for v in surfels.frames())
-    projected = center[:, :2] / center[:, 2:] * camera.focal + camera.principal
+    projected = camera.project(fields["centers"][front])[0]
 
     blocks = [np.arange(0, n, block) + block / 2 for n, block in zip(camera.size, BLOCK)]
     middle = np.stack(np.meshgrid(*blocks), -1)[:, :, None]  # [rows, columns, 1, 2]
-    ray = np.concatenate([(middle - camera.principal) / camera.focal, np.ones((*middle.shape[:3], 1))], -1)
+    plane = np.moveaxis((middle - projected) / camera.focal, -1, 0)
+    x, y = _about(camera.lens, *(center[:, :2] / center[:, 2:]).T, *plane)
+    ray = np.stack([x, y, np.ones_like(x)], -1)  # [rows, columns, N, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         t = (center * normal).sum(-1) / (ray * normal).sum(-1)  # [rows, columns, N]
         offset = t[..., None] * ray - center
@@ -47,29 +65,29 @@ def _front_to_back(surfels, camera) -> np.ndarray:
 def render_gbuffer_reference(surfels: "Surfels", camera: Camera, cutoffs: Cutoffs = Cutoffs()) -> Maps:
     """Return all maps of `render_gbuffer`, in the same frames and units."""
     width, height = camera.size
-    origin = mi.Point3f(camera.origin)
-    x_axis, y_axis, z_axis = (mi.Vector3f(row) for row in camera.rotation)
+    rotation, origin, focal, principal, lens = opaque(camera)
 
     centers = surfels.column(mi.Point3f, "centers")
-    depth = dr.dot(centers - origin, z_axis)
+    depth = (rotation @ (centers - origin)).z
     order = _front_to_back(surfels, camera)
     n = order.shape[1]
     surfel = mi.UInt32(order.ravel())  # pixel-major, front to back
     pixel = dr.arange(mi.UInt32, width * height * n) // n
     of = lambda kind, name: dr.gather(kind, getattr(surfels, name).array, surfel)
 
-    d = mi.Vector3f(np.ascontiguousarray(camera.rays().reshape(-1, 3).T.astype(np.float32)))  # camera-space z is 1
-    d = dr.gather(mi.Vector3f, d, pixel)
     t_u, t_v, normal = (dr.gather(mi.Vector3f, v, surfel) for v in surfels.frames())
     center, z = dr.gather(mi.Point3f, centers, surfel) - origin, dr.gather(mi.Float, depth, surfel)
     scales = of(mi.Vector2f, "scales")
+    local = rotation @ center
+    x, y = local.x / local.z, local.y / local.z
+    projected = mi.Vector2f(*((x, y) if lens is None else lens.distort(x, y)))
+    offset = mi.Vector2f(mi.Float(pixel % width) + 0.5, mi.Float(pixel // width) + 0.5) - principal - projected * focal
+    d = rotation.T @ mi.Vector3f(*_about(lens, x, y, *(offset / focal)), 1)  # its camera-space z is 1
     facing = dr.dot(center, normal)
     t = facing / dr.dot(d, normal)
     u, v = dr.dot(t * d - center, t_u) / scales.x, dr.dot(t * d - center, t_v) / scales.y
-    projected = mi.Vector2f(dr.dot(center, x_axis) * camera.focal[0], dr.dot(center, y_axis) * camera.focal[1]) / z
-    offset = mi.Vector2f(mi.Float(pixel % width) + 0.5, mi.Float(pixel // width) + 0.5) - mi.Vector2f(camera.principal)
     on_plane = dr.select(t > 0, u * u + v * v, dr.largest(mi.Float))
-    on_screen = LOW_PASS * dr.squared_norm(offset - projected)
+    on_screen = LOW_PASS * dr.squared_norm(offset)
     alpha = of(mi.Float, "opacities") * dr.exp(-0.5 * dr.minimum(on_plane, on_screen))
     alpha = dr.select(alpha > cutoffs.alpha_min, dr.minimum(alpha, cutoffs.alpha_max), 0)
     dr.eval(alpha)

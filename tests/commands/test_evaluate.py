@@ -65,6 +65,27 @@ def test_same_figures(inputs, copy):
     assert_same(evaluate.reevaluate(copy, inputs[1], quiet=True), before)  # again, and with the folder given
 
 
+def test_cameras_that_were_learned(inputs, tmp_path):
+    """Held-out views find their place again, and as well as before; the figures without it are beside."""
+    settings = ["cameras=learned", "exposure=learned", "cameras_start=0", "iterations=40"]
+    folder = fit(inputs, tmp_path / "run", *settings)
+    before, rows = metrics(folder), json.loads((folder / "cameras.json").read_text())
+    assert before["test_cameras"] == "pose and exposure fitted to the left half"
+    assert len(rows["train"]) == 12 and len(rows["evaluated"]) == 3
+    assert all(row["to_world"] != row["given"] for split in ("train", "evaluated") for row in rows[split].values())
+    assert before["cameras"]["rotation_deg"]["max"] > 0 and before["cameras"]["exposure_ev"]["max"] > 0
+    again = evaluate.reevaluate(folder, quiet=True)
+    assert_same(again, before)
+    assert again["psnr_unaligned"] == pytest.approx(before["psnr_unaligned"], rel=1e-4)
+    assert before["psnr"] > before["psnr_unaligned"]
+    assert (
+        before["views"]["r_1"].keys() >= {"psnr", "psnr_unaligned"} and "turned by" in (folder / "report.html").read_text()
+    )
+    (folder / "cameras.json").write_text('{"views": {}}')
+    with pytest.raises(UserError, match="cameras.json: damaged"):
+        evaluate.reevaluate(folder, quiet=True)
+
+
 @pytest.mark.parametrize(
     "overrides, options",
     [

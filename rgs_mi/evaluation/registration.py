@@ -1,0 +1,149 @@
+"""Held-out photographs find their place: pose and exposure fitted to a part of each, everything else fixed.
+
+Where a fit learns cameras its world is its own, and a held-out photograph's pose is off in it by as much as the fit has
+corrected those that it saw. So nine numbers are fitted to the left half of each, as others do (NeRF--, BARF, NeRF in the
+Wild), and the whole is scored.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.camera import Camera
+from ..core.color import display, srgb_encode
+from ..core.learned_camera import POSE, learned_camera
+from ..datasets.photographs import shrink
+from ..datasets.types import View
+from ..shading import deferred
+from ..shading.lighting import Lighting
+from ..surfels.surfels import Surfels
+
+_LEVELS, _LEAST = (8, 4, 2, 1), 24  # pixels of a photograph's side that make one of a level's; its least height
+_STEPS = 6  # of Levenberg and Marquardt, at most, on each level
+_PROBE = 0.5  # pixels that differences of poses move a picture by
+_STILL = 0.02  # pixels: a step that moves a picture by less is the last
+_DAMPING = 1e-3  # of the diagonal, at first
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Which numbers of held-out views are fitted: poses where cameras were learned, gains where exposures were; ``cameras``
+    {view's name: where it starts, which has the intrinsics that were learned}."""
+
+    poses: bool
+    exposure: bool
+    cameras: dict[str, Camera] = field(default_factory=dict)
+
+    @property
+    def words(self) -> str:
+        """What is fitted to what, as metrics.json says it."""
+        what = {(True, True): "pose and exposure", (True, False): "pose", (False, True): "exposure"}
+        return f"{what[self.poses, self.exposure]} fitted to the left half"
+
+
+@dataclass(frozen=True)
+class Registered:
+    """A view's ``camera``, and the ``gain`` [3] of its photograph against the fit's mean exposure (None: one)."""
+
+    camera: Camera
+    gain: np.ndarray | None = None
+
+
+def register(
+    registration: Registration, surfels: Surfels, lighting: Lighting | None, view: View, background: float
+) -> Registered:
+    """Fit pose and exposure of ``view`` to the left half of its photograph, coarse to fine, in least squares of display values
+    over the grey level ``background``.
+
+    The pose is that of `learned_camera` about the middle of the surfels. Its derivatives are central differences of half a
+    pixel: what is that far off is what counts, and no derivative kernels are compiled for it.
+    """
+    whole = registration.cameras.get(view.name, view.camera)
+    pivot = np.median(surfels.numpy()["centers"], axis=0)
+    numbers = np.zeros(len(POSE) + 3)
+    for downscale in _LEVELS:
+        if downscale > _LEVELS[-1] and view.camera.size[1] < _LEAST * downscale:
+            continue
+        problem = _Problem(registration, surfels, lighting, view, whole, pivot, background, downscale)
+        numbers = _minimized(problem, numbers)
+    camera = _moved(whole, whole, pivot, numbers[: len(POSE)]).baked() if registration.poses else whole
+    return Registered(camera, np.exp(numbers[len(POSE) :]) if registration.exposure else None)
+
+
+def _moved(camera, whole, pivot, pose):
+    """The window ``camera`` of ``whole`` after the correction ``pose`` (6 numbers)."""
+    opaque = [dr.opaque(mi.Float, float(v)) for v in pose]
+    return replace(camera, learned=learned_camera(whole, pivot, opaque))
+
+
+class _Problem:
+    """The least-squares problem of one level: residuals [P] of numbers [9], and their derivatives."""
+
+    def __init__(self, registration, surfels, lighting, view, whole, pivot, background, downscale):
+        self.registration, self.surfels, self.lighting, self.background = registration, surfels, lighting, background
+        self.whole, self.pivot = whole, pivot
+        target = shrink(display(view.pixels, background), downscale)
+        height, width = target.shape[:2]
+        part = max(width // 2, 1)
+        used = (
+            whole
+            if target.shape[:2] == view.pixels.shape[:2]
+            else whole.cropped(0, 0, width * downscale, height * downscale)
+        )
+        self.camera = used.resized(width, height).cropped(0, 0, part, height)
+        self.target = target[:, :part].reshape(-1, 3)
+        self.probe = _PROBE / float(np.mean(self.camera.focal))
+
+    def rendered(self, numbers):
+        """(linear radiance [P, 3], premultiplied; coverage [P, 1])."""
+        camera = self.camera
+        if self.registration.poses:
+            camera = _moved(camera, self.whole, self.pivot, numbers[: len(POSE)])
+        with dr.suspend_grad():
+            image = deferred.render(self.surfels, camera, self.lighting)
+            return image.color.numpy().T, image.gbuffer.all.alpha.numpy()[:, None]
+
+    def residuals(self, picture, numbers):
+        """[3 P]: the ``picture`` of `rendered`, as exposed, less the photograph."""
+        color, alpha = picture
+        straight = color * np.exp(numbers[len(POSE) :]) / np.maximum(alpha, 1e-6)
+        shown = srgb_encode(np.clip(straight, 0, 1)) * alpha + self.background * (1 - alpha)
+        return (np.clip(shown, 0, 1) - self.target).ravel()
+
+    def jacobian(self, picture, numbers):
+        """[3 P, 9], zero in what is not fitted."""
+        columns = np.zeros((self.target.size, len(numbers)))
+        for k in range(len(numbers)):
+            h = np.zeros(len(numbers))
+            if k < len(POSE) and self.registration.poses:
+                h[k] = self.probe
+                ahead, behind = (self.residuals(self.rendered(n), n) for n in (numbers + h, numbers - h))
+                columns[:, k] = (ahead - behind) / (2 * self.probe)
+            elif k >= len(POSE) and self.registration.exposure:
+                h[k] = 1e-3
+                columns[:, k] = (self.residuals(picture, numbers + h) - self.residuals(picture, numbers - h)) / 2e-3
+        return columns
+
+
+def _minimized(problem, numbers):
+    """Levenberg and Marquardt's method, from ``numbers``."""
+    damping, picture = _DAMPING, problem.rendered(numbers)
+    residuals = problem.residuals(picture, numbers)
+    for _ in range(_STEPS):
+        jacobian = problem.jacobian(picture, numbers)
+        normal, right = jacobian.T @ jacobian, jacobian.T @ residuals
+        for _ in range(4):
+            step = -np.linalg.solve(normal + np.diag(damping * np.diag(normal) + 1e-9), right)
+            ahead = problem.rendered(numbers + step)
+            lower = problem.residuals(ahead, numbers + step)
+            if lower @ lower < residuals @ residuals:
+                break
+            damping *= 10
+        else:
+            return numbers
+        numbers, picture, residuals, damping = numbers + step, ahead, lower, damping / 10
+        if np.abs(step).max() < _STILL * problem.probe / _PROBE:
+            return numbers
+    return numbers
