@@ -183,7 +183,7 @@ def sweep(
     """
     height, width = image.shape
     index = dr.arange(mi.UInt32, height * width)
-    rays, own, origin = pixel_rays(camera, index), as_float(image), opaque(camera)[1]
+    rays, own, origin = pixel_rays(camera, index), as_float(image), opaque(camera).origin
     scores = []
     placed = [
         (other, as_float(shown), None if hull is None else as_float(np.nan_to_num(hull, nan=np.inf)))
@@ -205,38 +205,15 @@ def sweep(
     return np.stack([score.numpy().reshape(height, width) for score in scores])
 
 
-<<<<<<< HEAD
 def _warp(point, other, image, surface, margin):
     """(values of the ``other`` view's ``image`` at ``point``, whether that can be its surface: in its frame, not above its
     hull)."""
     constant = lambda x: dr.opaque(mi.Float, float(x))
-    rotation, origin, focal, principal = opaque(other)
+    seen = opaque(other)
     width, height = other.size
-    local = rotation @ mi.Vector3f(point - origin)
-    x = local.x / local.z * focal.x + principal.x - 0.5
-    y = local.y / local.z * focal.y + principal.y - 0.5
-=======
-def _points(camera, depth, level):
-    """World points below the hull, one entry per level and pixel."""
-    filled = np.where(np.isfinite(depth), depth, np.nanmax(depth))
-    entry, n = dr.arange(mi.UInt32, filled.size * len(level)), dr.opaque(mi.UInt32, filled.size)
-    pixel = entry % n
-    z = dr.gather(mi.Float, as_float(filled), pixel) + dr.gather(mi.Float, as_float(level), entry // n)
-    point = opaque(camera).origin + pixel_rays(camera, pixel) * z
-    dr.eval(point)
-    return point
-
-
-def _warp(points, other, depth, margin):
-    """(grey levels of the ``other`` photograph at ``points``, whether these can be its surface: in its frame, not above its
-    hull)."""
-    constant = lambda x: dr.opaque(mi.Float, float(x))
-    seen = opaque(other.camera)
-    width, height = other.camera.size
-    local = seen.rotation @ mi.Vector3f(points - seen.origin)
+    local = seen.rotation @ mi.Vector3f(point - seen.origin)
     x = local.x / local.z * seen.focal.x + seen.principal.x - 0.5
     y = local.y / local.z * seen.focal.y + seen.principal.y - 0.5
->>>>>>> cameras
     inside = (local.z > 0) & (x >= 0) & (y >= 0) & (x < constant(width - 1)) & (y < constant(height - 1))
     column, row = dr.floor(x), dr.floor(y)
     at = mi.UInt32(dr.select(inside, row * constant(width) + column, 0))
@@ -276,7 +253,7 @@ def verified(maps: Sequence[DepthMap]) -> list[DepthMap]:
     for i, m in enumerate(maps):
         index = dr.arange(mi.UInt32, m.depth.size)
         depth = as_float(np.nan_to_num(m.depth))
-        points = opaque(m.camera)[1] + pixel_rays(m.camera, index) * depth
+        points = opaque(m.camera).origin + pixel_rays(m.camera, index) * depth
         dr.eval(points)
         count, same, through = _agreement(points, [maps[j] for j in neighbours(i, cameras, center, _WITNESSES)])
         alike = (count >= _VIEWS) & (same > _AGREED * (same + through)) & (depth > 0)
@@ -298,9 +275,10 @@ def _agreement(points, maps):
     """`agreement` of Dr.Jit's ``points``, after the number of ``maps`` that have a surface there."""
     count, same, through = (dr.zeros(mi.Float, dr.width(points)) for _ in range(3))
     for m in maps:
-        rotation, origin, focal, principal = opaque(m.camera)
-        local = rotation @ mi.Vector3f(points - origin)
-        x, y = local.x / local.z * focal.x + principal.x, local.y / local.z * focal.y + principal.y
+        seen = opaque(m.camera)
+        local = seen.rotation @ mi.Vector3f(points - seen.origin)
+        x = local.x / local.z * seen.focal.x + seen.principal.x
+        y = local.y / local.z * seen.focal.y + seen.principal.y
         width, height = (dr.opaque(mi.Float, float(n)) for n in m.camera.size)
         inside = (local.z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
         at = mi.UInt32(dr.select(inside, dr.floor(y) * width + dr.floor(x), 0))
