@@ -90,7 +90,7 @@ def depth_maps(views: Sequence[View], mesh: tuple | None = None, quiet: bool = T
     with Progress(quiet=quiet, label="comparing the photographs") as progress:
         small = [SmallImage.of(view) for view in views]
         cameras, images = [s.camera for s in small], [s.normalized for s in small]
-        surfaces = [None] * len(small) if mesh is None else hull.depth_maps(*mesh, cameras)
+        surfaces = [None] * len(small) if mesh is None else hull.depth_maps(mesh[0], mesh[1], cameras)
         levels, step = _levels(cameras, mesh)
         target = focus_point(cameras)[0] if mesh is None else mesh[0].mean(0)
         maps = []
@@ -191,7 +191,7 @@ def sweep(
     ]
     dr.eval(rays, own)
     for depth in depths:
-        z = as_float(depth) if np.ndim(depth) else dr.opaque(mi.Float, float(depth))
+        z = as_float(depth) if isinstance(depth, np.ndarray) else dr.opaque(mi.Float, float(depth))
         point = origin + rays * z
         found = [_warp(point, *other, margin) for other in placed]
         means = _means([dr.select(inside, value * own, -1) for value, inside in found], width, height)
