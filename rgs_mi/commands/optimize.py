@@ -20,6 +20,7 @@ from ..datasets.types import Dataset
 from ..fit import checkpoint
 from ..fit.events import Events
 from ..fit.model import Model
+from ..fit.plan import planned
 from ..fit.scene import FitScene
 from ..fit.trainer import Fit
 from ..priors import depth_priors
@@ -111,7 +112,9 @@ def _saved(folder, resume):
 
 def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = True) -> Fit:
     """Return the fit of a ``scene`` to the photographs of ``dataset``, at its beginning."""
+    settings = planned(settings, dataset)
     begin = settings.initialization
+    assert begin.surfels, "`planned` gives them"
     points = initial_points(dataset, begin.surfels, settings.seed, begin.hull, begin.compare, quiet)
     random = points[1] is None and not (dataset.points is not None and len(dataset.points))
     opacity = begin.opacity or (_ANYWHERE if random else _ON_SURFACE)
@@ -175,6 +178,7 @@ def _priors(dataset, settings):
 def _resume(saved, scene, dataset, settings) -> Fit:
     """The fit of a checkpoint, under ``settings``; tells which differ from those that it was saved with."""
     arrays, meta = saved
+    settings = planned(settings, dataset)
     if meta["photographs"] != _photographs(dataset):
         raise UserError(f"{dataset.root}: not the photographs of the checkpoint: give its --data, or another --out")
     old, new = _flat(meta["settings"]), _flat(to_dict(settings))

@@ -56,6 +56,7 @@ class Schedule:
     def stage(self, progress: float) -> Stage:
         """The level of the pyramid in use."""
         stages = self.settings.stages
+        assert stages, "`plan.planned` gives them"
         return next((stage for stage in stages if progress < stage.until), stages[-1])
 
     def sh_order(self, progress: float) -> int:
@@ -131,5 +132,6 @@ class Schedule:
         if not d.start <= progress < d.stop:
             return None
         opened = (progress - d.start) / (d.stop - d.start)
-        first, last = self.settings.initialization.surfels, self.settings.max_surfels
+        first, last = self.settings.initialization.surfels, d.max_surfels
+        assert first and last, "`plan.planned` gives them"
         return int(first + opened * (last - first))

@@ -1,6 +1,7 @@
 """The fit: views → render → loss → gradient → step → density, under a budget."""
 
 import time
+from collections import deque
 from dataclasses import replace
 
 import drjit as dr
@@ -10,7 +11,7 @@ import numpy as np
 from ..core.arrays import as_float
 from ..datasets.photographs import Photographs
 from ..datasets.types import Dataset, DepthPrior
-from ..settings.settings import Settings
+from ..settings.settings import Settings, Stage
 from ..shading import deferred
 from ..shading.lighting import Lighting, Shading, lighting_of
 from ..surfels.proxies import Proxies
@@ -21,9 +22,11 @@ from .curves import Curves
 from .density import DensityControl
 from .model import ENVIRONMENT, Model
 from .objective import Objective
+from .plan import LEAST_STEPS
 from .schedule import Schedule
 
 _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
+_PACE = 31  # steps whose median says how long one takes
 _DIVERGED = 10  # steps in a row without a finite error
 
 
@@ -54,6 +57,8 @@ class Fit:
         self.photographs: Photographs | None = None  # of the stage that has begun
         self.step_number, self.views_used, self.elapsed = 0, 0, 0.0
         self.psnr, self._failures = 0.0, 0
+        self._stage: Stage | None = None
+        self._seconds: deque[float] = deque(maxlen=_PACE)  # of the last steps of the stage
         # Of some steps ago: what reflected rays meet, what surfels hide of the light, and what samples the light
         self.proxies: Proxies | None = None
         self.irradiance_visibility: mi.Color3f | None = None
@@ -80,6 +85,9 @@ class Fit:
         if fit.cameras:
             fit.cameras.restore(arrays)
         fit.curves = Curves(meta["curves"])
+        if level := meta.get("level"):
+            fit._stage = next((s for s in settings.stages or () if s.downscale == level["downscale"]), None)
+            fit._seconds.append(level["seconds"])
         return fit
 
     @property
@@ -90,7 +98,17 @@ class Fit:
     @property
     def pixels(self) -> int:
         """Width of the images in use by now."""
-        return max(self.dataset.train[0].camera.size[0] // self.schedule.stage(self.progress).downscale, 1)
+        return max(self.dataset.train[0].camera.size[0] // self.stage.downscale, 1)
+
+    @property
+    def stage(self) -> Stage:
+        """The level of the pyramid in use: that of the schedule, unless there is no time for `LEAST_STEPS` there."""
+        stage, minutes = self.schedule.stage(self.progress), self.settings.minutes
+        if self._stage is None or stage.downscale >= self._stage.downscale or self.settings.iterations or not minutes:
+            return stage
+        pixels = (self._stage.downscale / stage.downscale) ** 2
+        seconds = float(np.median(self._seconds)) * pixels * stage.views / self._stage.views
+        return stage if 60 * minutes - self.elapsed > LEAST_STEPS * seconds else self._stage
 
     @property
     def sh_order(self) -> int:
@@ -144,7 +162,9 @@ class Fit:
         """One step of the optimizer on the next few views, and density control when it is due. Returns whether ``curves``
         has another row."""
         start, pixels, progress = time.monotonic(), self.pixels, self.progress
-        stage = self.schedule.stage(progress)
+        stage = self.stage
+        if stage != self._stage:
+            self._stage, self._seconds = stage, deque([self._seconds[-1]] if self._seconds else [], _PACE)
         if self.photographs is None or self.photographs.downscale != stage.downscale:
             self.photographs = Photographs(self.dataset.train, stage.downscale, self.settings.background, self.priors)
         self._follow_schedule()
@@ -166,6 +186,7 @@ class Fit:
         self._control_density()
         seconds = time.monotonic() - start
         self.elapsed += seconds
+        self._seconds.append(seconds)
         state = {"step": self.step_number, "seconds": self.elapsed, "surfels": len(self.model), "pixels": pixels}
         return self.curves.add(self.progress, state, {"psnr": self.psnr, "ms": 1e3 * seconds} | mean)
 

@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-_SURFELS, _SURFELS_A_MINUTE = 50_000, 5_000
 _MODEL = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 #: A learning rate at the beginning and at the end, joined geometrically.
@@ -33,7 +32,12 @@ class Stage:
 class Initialization:
     """Where the fit begins."""
 
-    surfels: int = Field(default=25_000, ge=1, le=10_000_000, description="The fit starts with so many surfels.")
+    surfels: int | None = Field(
+        default=None,
+        ge=1,
+        le=10_000_000,
+        description="The fit starts with so many surfels; unless given, half of `density.max_surfels`, 25,000 at least.",
+    )
     hull: bool = Field(
         default=True,
         description="Surfels start on the visual hull where photographs have masks, else on the data set's points, or at random.",
@@ -159,7 +163,8 @@ class Density:
         default=None,
         ge=1,
         le=10_000_000,
-        description=f"Never more surfels than this; unless given, {_SURFELS}, or {_SURFELS_A_MINUTE} a minute if more.",
+        description="Never more surfels than this; unless given, as many as photographs show pixels of the object, in the "
+        "mean, but 15,000 a minute at most; and 50,000, and 5,000 a minute, at least.",
     )
     guided: bool = Field(
         default=False,
@@ -259,17 +264,14 @@ class Settings:
         description="Whether exposure and white balance of each photograph are learned; `auto` as for `cameras`.",
     )
     checkpoint_seconds: float = Field(default=20.0, ge=0, le=1e6, description="Seconds from one checkpoint to the next.")
-    stages: tuple[Stage, ...] = Field(
-        default=(Stage(0.2, 2, 1), Stage(1.0, 1, 1)),
-        description="The coarse-to-fine pyramid, a mapping of `until`, `downscale` and `views` for each level.",
+    stages: tuple[Stage, ...] | None = Field(
+        default=None,
+        description="The coarse-to-fine pyramid, a mapping of `until`, `downscale` and `views` for each level; unless given, by "
+        "halves, from some 200 pixels along the longer side to all of them from 20 % of the fit on. Bounded by `minutes`, a fit "
+        "stays at a level where there is no time for enough steps at the next.",
     )
     initialization: Initialization = Initialization()
     learning_rates: LearningRates = LearningRates()
     weights: Weights = Weights()
     prior: Prior = Prior()
     density: Density = Density()
-
-    @property
-    def max_surfels(self) -> int:
-        """The most surfels that a fit may have: unless they are given, as many as it has time for."""
-        return self.density.max_surfels or max(_SURFELS, int(_SURFELS_A_MINUTE * (self.minutes or 0)))

@@ -11,9 +11,10 @@ import pytest
 from rgs_mi.commands.optimize import start
 from rgs_mi.core.arrays import as_float
 from rgs_mi.datasets.photographs import Photographs
-from rgs_mi.datasets.types import DepthPrior
+from rgs_mi.datasets.types import Dataset, DepthPrior
 from rgs_mi.fit import losses, schedule
 from rgs_mi.fit.density import Gradients
+from rgs_mi.fit.plan import planned
 from rgs_mi.fit.trainer import Fit
 from rgs_mi.settings.settings import Density, Initialization, LearningRates, Settings, Stage, Weights
 from rgs_mi.shading import deferred
@@ -212,7 +213,7 @@ def test_a_view_that_overflows_does_not_end_a_fit(dataset):
     linear = dataset.train[2].pixels.astype(np.float32) / 255
     linear[37, 41, 0] = np.nan
     views = [replace(view, pixels=linear) if k == 2 else view for k, view in enumerate(dataset.train)]
-    density = Density(start=0.0, stop=1.0, refine_every=10)
+    density = Density(max_surfels=300, start=0.0, stop=1.0, refine_every=10)
     fit = Fit(replace(dataset, train=views), model(), replace(SETTINGS, density=density), 1.0)
     errors = []
     while fit.progress < 1:
@@ -348,13 +349,36 @@ def test_opacities_to_start_with(dataset, where, opacity):
 
 
 @pytest.mark.parametrize(
-    "changes, surfels",
+    "changes, pixels, most, first",
     [
-        ({"minutes": 8.0}, 50_000),
-        ({"minutes": 30.0}, 150_000),
-        ({"minutes": None, "iterations": 10**6}, 50_000),
-        ({"minutes": 30.0, "density": Density(max_surfels=7)}, 7),
+        ({"minutes": 8.0}, 40, 50_000, 25_000),
+        ({"minutes": 30.0}, 40, 150_000, 75_000),
+        ({"minutes": None, "iterations": 10**6}, 400, 50_000, 25_000),
+        ({"minutes": 10.0}, 320, 102_400, 51_200),
+        ({"minutes": 4.0}, 320, 60_000, 30_000),
+        ({"minutes": 30.0, "density": Density(max_surfels=7)}, 40, 7, 7),
+        ({"initialization": Initialization(surfels=9)}, 40, 50_000, 9),
     ],
 )
-def test_surfels_for_the_time(changes, surfels):
-    assert replace(Settings(), **changes).max_surfels == surfels
+def test_surfels_for_the_time_and_the_photographs(dataset, changes, pixels, most, first):
+    camera = replace(dataset.train[0].camera, size=(pixels, pixels))
+    view = replace(dataset.train[0], camera=camera, masked=False)
+    plan = planned(replace(Settings(), **changes), Dataset([view], []))
+    assert (plan.density.max_surfels, plan.initialization.surfels) == (most, first)
+
+
+@pytest.mark.parametrize(
+    "pixels, stages",
+    [
+        (64, [(0.2, 2), (1, 1)]),
+        (400, [(0.2, 2), (1, 1)]),
+        (800, [(0.1, 4), (0.2, 2), (1, 1)]),
+        (1600, [(0.05, 8), (0.1, 4), (0.2, 2), (1, 1)]),
+    ],
+)
+def test_the_pyramid_begins_at_some_200_pixels(dataset, pixels, stages):
+    view = replace(dataset.train[0], camera=replace(dataset.train[0].camera, size=(pixels, pixels // 2)), masked=False)
+    plan = planned(Settings(), Dataset([view], []))
+    assert [(s.until, s.downscale) for s in plan.stages] == stages and {s.views for s in plan.stages} == {1}
+    own = (Stage(1.0, 3, 2),)
+    assert planned(replace(Settings(), stages=own), Dataset([view], [])).stages == own

@@ -1,0 +1,51 @@
+"""What a fit does of itself where settings leave it open: how many surfels, and how far up the pyramid, for these photographs in
+this time."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..datasets.types import Dataset, View
+from ..settings.settings import Settings, Stage
+
+_SURFELS, _SURFELS_A_MINUTE = 50_000, (5_000, 15_000)  # at least; a minute at least, and at most
+_FIRST = 25_000  # surfels to start with, at least
+_COARSEST, _FINEST_FROM = 200, 0.2  # pixels along the longer side, about; the part of the fit before full resolution
+LEAST_STEPS = 1000  # that a finer level must have time for
+
+
+def planned(settings: Settings, dataset: Dataset) -> Settings:
+    """Return ``settings`` with numbers where they leave open what suits the photographs of ``dataset``:
+
+    density.max_surfels     as many as a photograph shows pixels of the object, in the mean; but 15 000 a minute at most, and
+                            50 000, and 5000 a minute, at least
+    initialization.surfels  half of these, 25 000 at least
+    stages                  halves of halves down to some 200 pixels; from 20 % of the fit on all pixels, from 10 % on half of
+                            them along a side, and so on
+    """
+    density, first = settings.density, settings.initialization.surfels
+    if (most := density.max_surfels) is None:
+        minutes = settings.minutes or 0
+        least, limit = (int(rate * minutes) for rate in _SURFELS_A_MINUTE)
+        most = max(_SURFELS, least, min(limit, int(np.mean([_foreground(view) for view in dataset.train]))))
+    if first is None:
+        first = min(max(_FIRST, most // 2), most)
+    stages = settings.stages or _stages(max(dataset.train[0].camera.size))
+    return replace(
+        settings,
+        density=replace(density, max_surfels=most),
+        initialization=replace(settings.initialization, surfels=first),
+        stages=stages,
+    )
+
+
+def _foreground(view: View) -> float:
+    """How many pixels of a photograph show the object: all, where it has no mask."""
+    return float(view.alpha.sum()) if view.masked else float(np.prod(view.camera.size))
+
+
+def _stages(pixels: int) -> tuple[Stage, ...]:
+    """The pyramid of photographs so many ``pixels`` along their longer side."""
+    halvings = max(1, round(np.log2(pixels / _COARSEST)))
+    coarse = (Stage(_FINEST_FROM / 2 ** (k - 1), 2**k, 1) for k in range(halvings, 0, -1))
+    return *coarse, Stage(1.0, 1, 1)
