@@ -15,9 +15,11 @@ from ..datasets.types import View
 from ..fit import losses
 from ..shading import deferred
 from ..shading.lighting import Lighting
+from ..splat.tiles import TILE
 from ..surfels.surfels import Surfels
 from . import lpips, metrics
 
+_MOST_SAMPLES = 1 << 20  # of a rendering that is in memory at once
 #: Scores of one view; the mean over views has the same names.
 SCORES = ("psnr", "ssim", "lpips", "lpips_alex", "normal_mae_deg", "normal_ssim", "normal_lpips")
 
@@ -48,33 +50,45 @@ def render_view(
     """Render ``surfels`` under ``lighting`` (None: diffuse only) over the display-space grey level ``background``, with
     ``spp`` samples per pixel, rounded up to a square: linear radiance and all maps are means over a grid, as those of
     'rgs_deferred'. The image, but no map, is exposed with ``gain`` [3]."""
-    (width, height), (fine, side) = camera.size, camera.subdivided(spp)
     with dr.suspend_grad():
-        image = deferred.render(surfels, fine, lighting)
-        m = image.gbuffer.all
-        length = dr.norm(m.normal)
-        normal = dr.select(length > 0, m.normal * (m.alpha / length), 0)
-        maps = {
-            "color": image.color,
-            "diffuse": image.diffuse,
-            "specular": image.specular,
-            "sh_normal": normal,
-            "base_color": m.base_color,
-            "roughness": m.roughness,
-            "metallic": m.metallic,
-            "depth": m.depth,
-            "alpha": m.alpha,
-        }
-        dr.eval(maps)
-        samples = {k: np.atleast_2d(v.numpy()).T.reshape(height, side, width, side, -1) for k, v in maps.items()}
-        means = {k: v.mean((1, 3)) for k, v in samples.items()}
+        bands = [_means(surfels, lighting, band, spp) for band in _bands(camera, spp)]
+        means = {name: np.concatenate([band[name] for band in bands]) for name in bands[0]}
         alpha = means.pop("alpha")
         length = np.linalg.norm(means["sh_normal"], axis=-1, keepdims=True)
         means["sh_normal"] *= alpha / np.where(length > 0, length, 1)
         exposed = means["color"] if gain is None else means["color"] * gain
         color = mi.Color3f(*(as_float(exposed[..., k]) for k in range(3)))
-        shown = losses.display(color, as_float(alpha), background).numpy().T.reshape(height, width, 3)
+        shown = losses.display(color, as_float(alpha), background).numpy().T.reshape(*alpha.shape[:2], 3)
     return Rendering(np.clip(shown, 0, 1), alpha, means)
+
+
+def _bands(camera, spp):
+    """The camera's picture in bands of `_MOST_SAMPLES` at most, or nearly so: what a band needs lies in memory at once."""
+    width, height = camera.size
+    rows = max(TILE[1], _MOST_SAMPLES // (width * spp) // TILE[1] * TILE[1])
+    return [camera.cropped(0, y, width, min(rows, height - y)) for y in range(0, height, rows)]
+
+
+def _means(surfels, lighting, camera, spp):
+    """Maps of what ``camera`` sees, [H, W, channels], means over the samples of each pixel."""
+    (width, height), (fine, side) = camera.size, camera.subdivided(spp)
+    image = deferred.render(surfels, fine, lighting)
+    m = image.gbuffer.all
+    length = dr.norm(m.normal)
+    maps = {
+        "color": image.color,
+        "diffuse": image.diffuse,
+        "specular": image.specular,
+        "sh_normal": dr.select(length > 0, m.normal * (m.alpha / length), 0),
+        "base_color": m.base_color,
+        "roughness": m.roughness,
+        "metallic": m.metallic,
+        "depth": m.depth,
+        "alpha": m.alpha,
+    }
+    dr.eval(maps)
+    samples = {k: np.atleast_2d(v.numpy()).T.reshape(height, side, width, side, -1) for k, v in maps.items()}
+    return {k: v.mean((1, 3)) for k, v in samples.items()}
 
 
 def ground_truth(view: View, background: float) -> np.ndarray:
@@ -126,16 +140,17 @@ def _finite(value):
 
 
 def frames_per_second(
-    surfels: Surfels, lighting: Lighting | None, cameras: Sequence[Camera], spp: int = 1, frames: int = 20
+    surfels: Surfels, lighting: Lighting | None, cameras: Sequence[Camera], spp: int = 1, seconds: float = 4.0
 ) -> float:
-    """Return the median of frames per second over ``frames`` renderings of ``cameras`` in turn, with ``spp`` samples per
-    pixel: G-buffer and shading, kernels compiled and the environment filtered beforehand."""
-    seconds, cameras = [], [camera.subdivided(spp)[0] for camera in cameras]
+    """Return the median of frames per second over renderings of ``cameras`` in turn, for some ``seconds`` and three at least,
+    with ``spp`` samples per pixel: G-buffer and shading, kernels compiled and the environment filtered beforehand."""
+    spent = []
     with dr.suspend_grad():
-        for k in range(frames + 1):
+        while len(spent) < 4 or sum(spent) < seconds:
             dr.sync_thread()
             start = time.perf_counter()
-            dr.eval(deferred.render(surfels, cameras[k % len(cameras)], lighting).color)
+            for band in _bands(cameras[len(spent) % len(cameras)], spp):
+                dr.eval(deferred.render(surfels, band.subdivided(spp)[0], lighting).color)
             dr.sync_thread()
-            seconds.append(time.perf_counter() - start)
-    return float(1 / np.median(seconds[1:]))
+            spent.append(time.perf_counter() - start)
+    return float(1 / np.median(spent[1:]))
