@@ -1,5 +1,5 @@
-"""A capture from photographs or a video: cameras, lens, points and masks in nerfstudio's layout, which fits read. What `rgs-mi
-capture` calls.
+"""A capture from photographs or a video: cameras, lens, points and masks in nerfstudio's layout, which fits read. What the
+verb ``capture`` calls.
 
 Everything is made in a folder beside the capture's, which appears whole or not at all.
 """
