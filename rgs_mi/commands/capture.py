@@ -1,5 +1,5 @@
-"""A capture from photographs or a video: cameras, lens, points and masks in nerfstudio's layout, which fits read. What `rgs-mi
-capture` calls.
+"""A capture from photographs or a video: cameras, lens, points and masks in nerfstudio's layout, which fits read. What the
+verb ``capture`` calls.
 
 Everything is made in a folder beside the capture's, which appears whole or not at all.
 """
@@ -63,7 +63,7 @@ def capture(
         made = work / "capture"
         (made / "images").mkdir(parents=True)
         with _Phases(quiet) as phases:
-            placed, lost, lines = _make(source, made, work, masks, words, frames, longest, phases)
+            placed, lost, lines = _make(source, made, work, f"Capture {out.name}", masks, words, frames, longest, phases)
         if out.exists():
             out.rmdir()
         made.rename(out)
@@ -93,7 +93,7 @@ def _checked(source, out, masks, mask_command, frames) -> list[str]:
     return mask_files.check_command(mask_command) if mask_command else []
 
 
-def _make(source, made, work, masks, words, frames, longest, phases) -> tuple[int, int, list[str]]:
+def _make(source, made, work, title, masks, words, frames, longest, phases) -> tuple[int, int, list[str]]:
     """Fill the folder ``made``; return how many photographs have a place, how many have none, and what to do better."""
     images, mask_folder = made / "images", made / "masks"
     if source.is_dir():
@@ -113,7 +113,7 @@ def _make(source, made, work, masks, words, frames, longest, phases) -> tuple[in
     silhouettes = {s.name: found for s in placed if (found := mask_files.silhouette(images / s.name, paths[s.name]))}
     write_json(made / FILE, _transforms(structure, cameras, {name for name, path in paths.items() if path.is_file()}))
     _write_points(made / POINTS, points, structure.colors)
-    lines = page.write(made, f"Capture {source.resolve().name}", structure, cameras, points, taken, silhouettes)
+    lines = page.write(made, title, structure, cameras, points, taken, silhouettes)
     for name in structure.left_out:
         (images / name).unlink()
         paths[name].unlink(missing_ok=True)

@@ -30,7 +30,7 @@ _LEAST_FEATURES, _LEAST_INLIERS = 50, 15  # of a photograph; of a pair
 # of a model; degrees from camera to camera at the points' median, which a lens makes up where cameras only turn
 _LEAST_VIEWS, _LEAST_POINTS, _LEAST_ANGLE = 3, 60, 6.0
 _TRUE_TRACK, _TRUE_ERROR = 3, 2.0  # points are kept that so many photographs show, pixels off at most
-_CENTRE_VIEWS, _CENTRE_SHIFT = 10, 0.08  # the principal point is estimated from so many; a larger shift is no lens's
+_CENTRE_VIEWS, _CENTRE_SHIFT = 25, 0.025  # the principal point is estimated from so many; a larger shift is no lens's
 
 
 @dataclass(frozen=True)
@@ -97,14 +97,18 @@ def structure_from_motion(
     try:
         _extract(database, folder, sizes, done, threads)
         _match(database, work / "pairs.txt", names, done, threads)
-        model = _map(database, folder, work / "models", len(names), done, threads)
+        models = _map(database, folder, work / "models", len(names), done, threads)
     except RuntimeError as error:
         reason = (str(error).strip().splitlines() or ["no reason given"])[-1][:200]
         raise UserError(f"COLMAP can't place these photographs ({reason}): {REMEDY}") from error
     reasons = _reasons(database)
-    if model is None:
+    if not models:
         raise UserError(_unplaced(reasons, names))
-    return _checked(model, work / "model", names, reasons)
+    why = {name: _why(*reasons.get(name, (0, 0))) for name in names}
+    for model in reversed(models):
+        group = [image.name for image in model.images.values() if image.has_pose]
+        why |= dict.fromkeys(group, f"fits {len(group) - 1} others, but not the rest: nothing was taken from between them")
+    return _checked(_with_centre(models[0], threads), work / "model", names, why)
 
 
 def pairs(names: Sequence[str]) -> list[tuple[str, str]]:
@@ -166,7 +170,7 @@ def _match(database, file, names, done, threads):
 
 
 def _map(database, folder, models, count, done, threads):
-    """The largest reconstruction, or None."""
+    """The reconstructions, each of photographs that have something in common, the largest first."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=0, min_model_size=_LEAST_VIEWS)
@@ -175,9 +179,7 @@ def _map(database, folder, models, count, done, threads):
     found = pycolmap.incremental_mapping(
         database, folder, models, options, next_image_callback=lambda: done("poses", min(next(placed) / count, 1.0))
     )
-    if not found:
-        return None
-    return _with_centre(max(found.values(), key=lambda model: model.num_reg_images()), threads)
+    return sorted(found.values(), key=lambda model: model.num_reg_images(), reverse=True)
 
 
 def _with_centre(model, threads):
@@ -206,7 +208,7 @@ def _with_centre(model, threads):
 # ---- What came out ----
 
 
-def _checked(model, folder, names, reasons) -> Structure:
+def _checked(model, folder, names, why) -> Structure:
     """The `Structure` of a reconstruction. Raises: UserError where it is none to rely on."""
     folder.mkdir()
     model.write_binary(folder)
@@ -227,7 +229,7 @@ def _checked(model, folder, names, reasons) -> Structure:
         observations,
         points,
         np.array([p.color for p in kept], np.uint8),
-        {name: _why(*reasons.get(name, (0, 0))) for name in names if name not in placed},
+        {name: why[name] for name in names if name not in placed},
     )
 
 

@@ -14,7 +14,8 @@ from rgs_mi.commands import capture as command
 from rgs_mi.commands.capture import capture
 from rgs_mi.core.alignment import pose_errors
 from rgs_mi.core.errors import UserError
-from rgs_mi.datasets import load_dataset, sources
+from rgs_mi.datasets import load_dataset, sources, structure_from_motion
+from rgs_mi.datasets.images import image_size
 from rgs_mi.datasets.structure_from_motion import pairs
 
 import photographs
@@ -231,6 +232,26 @@ def test_one_photograph(tmp_path):
     pytest.importorskip("pycolmap")
     save(tmp_path / "in/a.jpg")
     refused("1 photographs are too few: give 3 at the very least", "in", "out")
+
+
+def test_exif_tells_the_focal_length(tmp_path):
+    """Also of what is turned; photographs that lie and stand have a lens each."""
+    pytest.importorskip("pycolmap")
+    for name, orientation in (("a", 1), ("b", 6), ("c", 1)):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        exif.get_ifd(0x8769)[0xA405] = 40
+        save(tmp_path / f"in/{name}.jpg", (160, 120), exif=exif)
+    for name in ("out", "work"):
+        (tmp_path / name).mkdir()
+    found = sources.photographs(tmp_path / "in", tmp_path / "out", 1600, lambda fraction: None)
+    sizes = {s.name: image_size(tmp_path / "out" / s.name, "") for s in found}
+    database = tmp_path / "work/database.db"
+    structure_from_motion._extract(database, tmp_path / "out", sizes, lambda *_: None, 1)
+    lenses = structure_from_motion._query(database, "SELECT width, height, params FROM cameras")
+    assert [lens[:2] for lens in lenses] == [(160, 120), (120, 160)]
+    for *_, parameters in lenses:
+        np.testing.assert_allclose(np.frombuffer(parameters)[:2], 40 / np.hypot(36, 24) * 200, rtol=1e-3)
 
 
 def test_no_texture(tmp_path):
