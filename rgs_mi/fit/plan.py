@@ -11,7 +11,7 @@ from ..settings.settings import Settings, Stage
 _SURFELS, _SURFELS_A_MINUTE = 50_000, (5_000, 15_000)  # at least; a minute at least, and at most
 _FIRST = 25_000  # surfels to start with, at least
 _COARSEST, _FINEST_FROM = 200, 0.2  # pixels along the longer side, about; the part of the fit before full resolution
-LEAST_STEPS = 1000  # that a finer level must have time for
+STEPS, LEAST_STEPS = 1000, 250  # of a level before the next; that the next must have time for
 
 
 def planned(settings: Settings, dataset: Dataset) -> Settings:

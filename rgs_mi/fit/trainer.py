@@ -102,13 +102,14 @@ class Fit:
 
     @property
     def stage(self) -> Stage:
-        """The level of the pyramid in use: that of the schedule, unless there is no time for `LEAST_STEPS` there."""
-        stage, minutes = self.schedule.stage(self.progress), self.settings.minutes
-        if self._stage is None or stage.downscale >= self._stage.downscale or self.settings.iterations or not minutes:
+        """The level of the pyramid in use: that of the schedule, in a fit that minutes bound after `STEPS` of the level before,
+        and if there is time for `LEAST_STEPS`."""
+        stage, now, minutes = self.schedule.stage(self.progress), self._level, self.settings.minutes
+        if now is None or self.settings.iterations or minutes is None or stage.downscale >= now.stage.downscale:
             return stage
-        pixels = (self._stage.downscale / stage.downscale) ** 2
-        seconds = float(np.median(self._seconds)) * pixels * stage.views / self._stage.views
-        return stage if 60 * minutes - self.elapsed > LEAST_STEPS * seconds else self._stage
+        pixels = (now.stage.downscale / stage.downscale) ** 2 * stage.views / now.stage.views
+        affordable = 60 * minutes - self.elapsed > LEAST_STEPS * pixels * now.pace
+        return stage if affordable and now.steps >= STEPS else now.stage
 
     @property
     def sh_order(self) -> int:

@@ -127,24 +127,27 @@ def _silhouettes(views) -> list[_Silhouette]:
     return found
 
 
-def _carve(silhouettes, points: np.ndarray, truncation: float) -> np.ndarray:
-    """The field [N] at ``points`` [N, 3], clipped to ± ``truncation``.
+def _carve(silhouettes, points: np.ndarray, truncation: float, outvoted: int = 0) -> np.ndarray:
+    """The field [N] at ``points`` [N, 3], clipped to ± ``truncation``: the least distance but for so many ``outvoted``.
 
-    Points drop out as soon as a view puts them further outside than the truncation. Points that fewer than a
-    quarter of the views decide are outside, too.
+    Points drop out as soon as more views than these put them further outside than the truncation. Points that fewer
+    than a quarter of the views decide are outside, too.
     """
 
     def chunk(points):
-        value = np.full(len(points), truncation, np.float32)
+        least = np.full((outvoted + 1, len(points)), truncation, np.float32)
         count = np.zeros(len(points), np.int32)
         alive = np.arange(len(points))
         for silhouette in silhouettes:
             sample = silhouette.sample(points[alive])
-            count[alive] += ~np.isnan(sample)
-            value[alive] = sample = np.fmin(value[alive], sample)
-            alive = alive[sample > -truncation]
-        value[alive[count[alive] < len(silhouettes) / 4]] = -truncation
-        return np.maximum(value, -truncation)
+            decided = ~np.isnan(sample)
+            count[alive] += decided
+            sample = np.where(decided, sample, np.inf)
+            for row in least:  # ascending
+                row[alive], sample = np.minimum(row[alive], sample), np.maximum(row[alive], sample)
+            alive = alive[least[-1, alive] > -truncation]
+        least[-1, alive[count[alive] < len(silhouettes) / 4]] = -truncation
+        return np.maximum(least[-1], -truncation)
 
     # Neighbouring views are alike: a stride that visits them far apart lets points drop out early.
     order = np.argsort((np.arange(len(silhouettes)) * 0.618034) % 1, kind="stable")
@@ -178,14 +181,14 @@ def object_box(views: Sequence[View]) -> tuple[np.ndarray, np.ndarray]:
     return _object_box(_silhouettes(views))
 
 
-def _object_box(silhouettes):
+def _object_box(silhouettes, outvoted=0):
     center, reach = focus_point([s.camera for s in silhouettes])
     lower, upper = center - reach, center + reach
     for _ in range(8):
         step = (upper - lower).max() / 40
         points, _ = _grid(lower, upper, step)
         # A cell counts while any part of it may be inside: its corners are at most 0.87 steps away.
-        left = points[_carve(silhouettes, points, 2 * step) > -0.87 * step]
+        left = points[_carve(silhouettes, points, 2 * step, outvoted) > -0.87 * step]
         if not len(left):
             raise UserError(
                 "the silhouettes of the views have no common volume: check that the cameras belong to the "
@@ -208,17 +211,13 @@ def carve(views: Sequence[View], box: tuple[np.ndarray, np.ndarray], resolution:
     return _field(_silhouettes(views), box, resolution)
 
 
-def visual_hull(views: Sequence[View], resolution: int | None = None) -> SignedField:
-    """Return `carve` inside `object_box`, measuring the silhouettes once. Unless ``resolution`` is given, a step is as long
-    as the typical photograph's pixel is there, but for a least and a greatest number of steps."""
-    return visual_hulls(views, resolution)[0]
-
-
-def visual_hulls(views: Sequence[View], *resolutions: int | None) -> list[SignedField]:
-    """Return the `visual_hull` at each of ``resolutions``, measuring silhouettes and box once for all."""
+def visual_hull(views: Sequence[View], resolution: int | None = None, outvoted: int = 0) -> SignedField:
+    """Return `carve` inside `object_box`, measuring the silhouettes once, but for so many views ``outvoted`` at each point:
+    masks drawn by hand are wrong here and there. Unless ``resolution`` is given, a step is as long as the typical
+    photograph's pixel is there, but for a least and a greatest number of steps."""
     silhouettes = _silhouettes(views)
-    box = _object_box(silhouettes)
-    return [_field(silhouettes, box, resolution or _pixels_across(silhouettes, *box)) for resolution in resolutions]
+    box = _object_box(silhouettes, outvoted)
+    return _field(silhouettes, box, resolution or _pixels_across(silhouettes, *box), outvoted)
 
 
 def _pixels_across(silhouettes, lower, upper) -> int:
@@ -228,18 +227,18 @@ def _pixels_across(silhouettes, lower, upper) -> int:
     return int(np.clip((upper - lower).max() * np.median(pixels), *_STEPS))
 
 
-def _field(silhouettes, box, resolution):
+def _field(silhouettes, box, resolution, outvoted=0):
     lower, upper = (np.asarray(corner, np.float64) for corner in box)
     step = float((upper - lower).max() / resolution)
     lower = lower - 2 * step  # the surface closes inside the grid
     coarse, shape = _grid(lower, upper + 2 * step, 4 * step)
-    coarse = _carve(silhouettes, coarse, 8 * step).reshape(shape)
+    coarse = _carve(silhouettes, coarse, 8 * step, outvoted).reshape(shape)
     shape = _shape(lower, upper + 2 * step, step)
     # A distance changes by no more than the way gone, here at most 3.5 steps to the nearest coarse node: only where the
     # coarse field is smaller than that (and a margin) can the surface be.
     values = ndimage.affine_transform(coarse, np.full(3, 1 / 4), output_shape=shape, order=1, mode="nearest")
     band = np.argwhere(np.abs(values) < 4.5 * step)
-    values[tuple(band.T)] = _carve(silhouettes, (lower + step * band).astype(np.float32), 3 * step)
+    values[tuple(band.T)] = _carve(silhouettes, (lower + step * band).astype(np.float32), 3 * step, outvoted)
     values = ndimage.gaussian_filter(np.clip(values, -3 * step, 3 * step), 0.6)
     for axis in range(3):
         np.moveaxis(values, axis, 0)[[0, -1]] = -step

@@ -13,6 +13,7 @@ from .surface_points import oriented_points, seen_through
 
 _FAR = 10
 _DEEPER = 2  # area of what lies below the hull, over that of the hull that is seen through
+_A_WRONG_MASK = 32  # in so many photographs one mask may be wrong at any point
 _FEW = 0.1  # of the points that are wanted: fewer that photographs agree on are no start
 _SRGB_TO_LINEAR = srgb_decode(np.arange(256) / 255).astype(np.float32)
 
@@ -26,7 +27,8 @@ def initial_points(
 ) -> Points:
     """Return the starting points of a fit to ``dataset.train``, world space, all float32 (docs/method.md §5).
 
-    Where photographs have masks and ``on_hull`` is set, ``count`` points on the visual hull; with ``compare`` less those that
+    Where images have masks and ``on_hull`` is set, ``count`` points on the visual hull (of photographs' masks few are
+    outvoted); with ``compare`` less those that
     photographs look through, plus what they agree on below it. Where they have none, about ``count`` points that photographs
     agree on, with ``compare``; else, or where these are few, ``dataset.points`` (a random ``count`` of them where there are
     more), else ``count`` points at random in the ball that the cameras look into. ``quiet``: no progress.
@@ -37,7 +39,7 @@ def initial_points(
     rng, views = np.random.default_rng(seed), dataset.train
     if any(view.masked for view in views):
         if on_hull:
-            return _on_hull(views, count, rng, compare, quiet)
+            return _on_hull(views, count, rng, compare, len(views) // _A_WRONG_MASK if dataset.photographed else 0, quiet)
     elif compare:
         positions, normals = oriented_points(stereo.verified(stereo.depth_maps(views, quiet=quiet)), count, rng)
         if len(positions) > _FEW * count:
@@ -57,9 +59,9 @@ def initial_points(
     return positions, None, _colors(positions, views), _spacing(positions)
 
 
-def _on_hull(views, count, rng, compare, quiet) -> Points:
+def _on_hull(views, count, rng, compare, outvoted, quiet) -> Points:
     """`initial_points` of an object with masks."""
-    mesh = hull.surface(hull.visual_hull(views))
+    mesh = hull.surface(hull.visual_hull(views, outvoted=outvoted))
     positions, normals = sample_surface(*mesh, count, rng)
     if compare:
         maps = stereo.verified(stereo.depth_maps(views, mesh[:2], quiet))

@@ -1,6 +1,7 @@
 """The visual hull and the initial points, on spheres with analytic masks written in the Blender layout."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -181,6 +182,17 @@ def test_views_that_lose_the_object_do_not_carve_it(data):
     vertices, _, _ = hull.surface(hull.visual_hull(data.train + close, 64))
     distance = np.linalg.norm(vertices - CENTRE, axis=1)
     assert distance.min() > RADIUS - 0.01 and distance.max() < RADIUS * 1.06
+
+
+def test_a_wrong_mask_is_outvoted(data):
+    """Half of the sphere is missing in one mask, which cuts it unless it is outvoted; a hull of few cones is hardly fatter."""
+    views = list(data.train)
+    pixels = views[3].pixels.copy()
+    pixels[:, : SIZE // 2, 3] = 0
+    views[3] = replace(views[3], pixels=pixels)
+    radius = lambda outvoted: np.linalg.norm(hull.surface(hull.visual_hull(views, 64, outvoted))[0] - CENTRE, axis=1)
+    assert radius(0).min() < 0.3 * RADIUS
+    assert radius(1).min() > 0.98 * RADIUS and np.median(radius(1)) < 1.04 * RADIUS
 
 
 def test_depth_maps(mesh):
