@@ -14,7 +14,12 @@ from ..settings.settings import Settings, Weights
 
 #: Names of what is learned: a row per view, per camera, and per view.
 POSES, LENSES, EXPOSURE = "poses", "intrinsics", "exposure"
-_POINTS, _NEAREST, _FLOOR = 500, 0.8, 1e-3  # of `_whitening`: points; most part of the distance; least eigenvalue
+_POINTS, _NEAREST, _FLOOR = (
+    500,
+    0.8,
+    0.05,
+)  # of `_whitening`: points; most part of the distance; part of the greatest eigenvalue
+_HOLD = 0.02  # of drift that a step takes out: all at once, surfels could not follow, and poses would fight for it
 _BETA = 0.9, 0.99  # of Adam; a row moves but some ten times in a fit, so its moments forget sooner than those of surfels
 
 
@@ -117,7 +122,7 @@ class Cameras:
 
     def step(self, rates: Mapping[str, float]) -> None:
         """Move what the views seen since the last step have gradients for, at the ``rates`` of `POSES`, `LENSES` and
-        `EXPOSURE`; then take out what surfels and light could follow: a similarity of the world, and a gain of all."""
+        `EXPOSURE`; then take out some of what surfels and light can follow: a similarity of the world, and a gain of all."""
         gradients: dict[str, dict[int, np.ndarray]] = {name: {} for name in self.rows}
         found = [[dr.grad(v) for v in leaf] for _, _, leaf in self._leaves]
         dr.eval(found)
@@ -127,11 +132,11 @@ class Cameras:
         self._leaves.clear()
         for name, found in gradients.items():
             self.rows[name].step(found, rates[name], self._bases if name == POSES else None)
-        if gradients.get(POSES):
+        if POSES in self.rows:
             poses = self.rows[POSES].value
-            poses -= (self._modes @ (self._modes.T @ poses.ravel())).reshape(poses.shape)
+            poses -= _HOLD * (self._modes @ (self._modes.T @ poses.ravel())).reshape(poses.shape)
         if EXPOSURE in self.rows:
-            self.rows[EXPOSURE].value -= self.rows[EXPOSURE].value.mean(0)
+            self.rows[EXPOSURE].value -= _HOLD * self.rows[EXPOSURE].value.mean(0)
 
     # ---- What came out ----
 
@@ -194,9 +199,10 @@ def _similarities(cameras, pivot) -> np.ndarray:
 
 
 def _whitening(cameras, pivot, extent) -> np.ndarray:
-    """[V, 6, 6]: bases of poses in which each coordinate moves what is seen of the object by as much, a unit by 1 in x/z units
-    (root mean square), and none does what others do (CamP, Park et al. 2023): C^(−1/2), with C the mean of JᵀJ over the
-    visible side of a sphere of radius ``extent`` and J the derivatives of x/z and y/z by the pose.
+    """[V, 6, 6]: bases of poses in which coordinates move what is seen of the object by much the same, a unit by 1 in x/z units
+    (root mean square), and none does what others do (CamP, Park et al. 2023): (C + λ)^(−1/2), with C the mean of JᵀJ over the
+    visible side of a sphere of radius ``extent`` and J the derivatives of x/z and y/z by the pose. What hardly shows is no
+    farther off than what does, so λ keeps the steps short that look for it.
 
     A camera sees the near side of the object alone, which turning about its middle shifts as well: without this the shift
     would have to be found before the turn shows.
@@ -219,5 +225,5 @@ def _whitening(cameras, pivot, extent) -> np.ndarray:
         weight = np.where(depth > 0, cosine, 0)
         covariance = np.einsum("cni,cnj,n->ij", jacobian, jacobian, weight) / max(weight.sum(), 1e-9)
         size, vectors = np.linalg.eigh(covariance)
-        bases.append((vectors / np.sqrt(np.maximum(size, _FLOOR * size[-1]))) @ vectors.T)
+        bases.append((vectors / np.sqrt(size + _FLOOR * size[-1])) @ vectors.T)
     return np.array(bases)
