@@ -25,10 +25,11 @@ _BETA = 0.9, 0.99  # of Adam; a row moves but some ten times in a fit, so its mo
 
 class Rows:
     """Rows of numbers [N, K] that Adam moves one by one, each with its own count of steps: a row without a gradient stays
-    where it is, and so do its moments. On NumPy arrays, double precision: there are few."""
+    where it is, and so do its moments. The numbers of a row share the second moment (VectorAdam, Ling et al. 2022): what has
+    little gradient moves little, where Adam's own would make a random walk of it. On NumPy arrays: there are few."""
 
     def __init__(self, count: int, width: int) -> None:
-        self.value, self.m, self.v = (np.zeros((count, width)) for _ in range(3))
+        self.value, self.m, self.v = np.zeros((count, width)), np.zeros((count, width)), np.zeros((count, 1))
         self.steps = np.zeros(count, np.int64)
 
     def step(self, gradients: Mapping[int, np.ndarray], rate: float, bases: np.ndarray | None = None) -> None:
@@ -41,7 +42,7 @@ class Rows:
             gradient = basis.T @ gradient
             self.steps[row] += 1
             self.m[row] += (1 - _BETA[0]) * (gradient - self.m[row])
-            self.v[row] += (1 - _BETA[1]) * (gradient**2 - self.v[row])
+            self.v[row] += (1 - _BETA[1]) * (np.mean(gradient**2) - self.v[row])
             m, v = ((x[row]) / (1 - beta ** self.steps[row]) for x, beta in zip((self.m, self.v), _BETA))
             self.value[row] -= rate * basis @ (m / np.maximum(np.sqrt(v), 1e-15))
 
@@ -130,8 +131,8 @@ class Cameras:
             gradient = np.array([float(v[0]) for v in leaf])
             gradients[name][row] = gradients[name].get(row, 0) + gradient
         self._leaves.clear()
-        for name, found in gradients.items():
-            self.rows[name].step(found, rates[name], self._bases if name == POSES else None)
+        for name, rows in gradients.items():
+            self.rows[name].step(rows, rates.get(name, 0.0), self._bases if name == POSES else None)
         if POSES in self.rows:
             poses = self.rows[POSES].value
             poses -= _HOLD * (self._modes @ (self._modes.T @ poses.ravel())).reshape(poses.shape)
