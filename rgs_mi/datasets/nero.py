@@ -46,6 +46,7 @@ def load(root: Path) -> Dataset:
         points=points,
         point_colors=colors,
         root=root,
+        photographed=False,
     )
 
 

@@ -14,11 +14,7 @@ from ..settings.settings import Settings, Weights
 
 #: Names of what is learned: a row per view, per camera, and per view.
 POSES, LENSES, EXPOSURE = "poses", "intrinsics", "exposure"
-_POINTS, _NEAREST, _FLOOR = (
-    500,
-    0.8,
-    0.05,
-)  # of `_whitening`: points; most part of the distance; part of the greatest eigenvalue
+_POINTS, _NEAREST, _DAMPING = 500, 0.8, 0.02  # of `_whitening`: points; the ball's radius over its distance, at most; λ
 _HOLD = 0.02  # of drift that a step takes out: all at once, surfels could not follow, and poses would fight for it
 _BETA = 0.9, 0.99  # of Adam; a row moves but some ten times in a fit, so its moments forget sooner than those of surfels
 
@@ -226,5 +222,5 @@ def _whitening(cameras, pivot, extent) -> np.ndarray:
         weight = np.where(depth > 0, cosine, 0)
         covariance = np.einsum("cni,cnj,n->ij", jacobian, jacobian, weight) / max(weight.sum(), 1e-9)
         size, vectors = np.linalg.eigh(covariance)
-        bases.append((vectors / np.sqrt(size + _FLOOR * size[-1])) @ vectors.T)
+        bases.append((vectors / np.sqrt(size + _DAMPING * size[-1])) @ vectors.T)
     return np.array(bases)
