@@ -72,7 +72,7 @@ class LearningRates:
     environment: Rates = Field(default=(6e-2, 5e-3), description="Of the environment's texels.")
     shader: Rates = Field(default=(1e-2, 1e-3), description="Of the network of `shader`.")
     poses: Rates = Field(
-        default=(1e-3, 3e-5), description="Of the cameras' poses: radians that what they show moves by in the picture."
+        default=(4e-3, 3e-5), description="Of the cameras' poses: radians that what they show moves by in the picture."
     )
     intrinsics: Rates = Field(
         default=(5e-5, 5e-6),
