@@ -234,7 +234,7 @@ class Settings:
         default=0.4, ge=0, le=1, description="Fraction of the fit from which view-dependent diffuse is learned."
     )
     cameras: Literal["auto", "fixed", "learned"] = Field(
-        default="auto",
+        default="fixed",
         description="Whether poses, focal lengths, principal points and distortion are learned; `auto`: of photographs, not of "
         "path-traced images.",
     )

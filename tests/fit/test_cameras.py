@@ -226,8 +226,8 @@ def test_who_learns(dataset):
     photographs = replace(dataset, photographed=True)
     rows = lambda *arguments: set(c.rows) if (c := Cameras.of(*arguments, 1.0)) else None
     assert rows(dataset, SETTINGS) is None
-    assert rows(photographs, SETTINGS) == {POSES, LENSES, EXPOSURE}
-    assert rows(photographs, replace(SETTINGS, cameras="fixed")) == {EXPOSURE}
+    assert rows(photographs, replace(SETTINGS, cameras="auto")) == {POSES, LENSES, EXPOSURE}
+    assert rows(photographs, SETTINGS) == {EXPOSURE}
     assert rows(photographs, replace(SETTINGS, cameras="fixed", exposure="fixed")) is None
     assert rows(dataset, replace(SETTINGS, cameras="learned")) == {POSES, LENSES}
 
@@ -248,7 +248,7 @@ def test_views_of_one_camera_share_its_intrinsics(dataset):
 
 def test_checkpoints_hold_cameras(dataset):
     photographs = replace(dataset, photographed=True)
-    settings = replace(SETTINGS, cameras_start=0.0)
+    settings = replace(SETTINGS, cameras="learned", cameras_start=0.0)
     fit = Fit(photographs, model(), settings, 1.0)
     for _ in range(8):
         fit.step()
@@ -261,7 +261,7 @@ def test_checkpoints_hold_cameras(dataset):
 
 def test_no_kernel_is_compiled_again(dataset):
     """Poses, gains and rates differ from step to step."""
-    fit = Fit(replace(dataset, photographed=True), model(), replace(SETTINGS, cameras_start=0.0), 1.0)
+    fit = Fit(replace(dataset, photographed=True), model(), replace(SETTINGS, cameras="learned", cameras_start=0.0), 1.0)
     for _ in range(9):
         fit.step()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
