@@ -56,7 +56,7 @@ def main():
     cameras = [view.camera for view in truth.train]
     center, _ = focus_point(cameras)
     distance = float(np.mean([np.linalg.norm(c.origin - center) for c in cameras]))
-    fit = start(scene, dataset, scene.settings(None, args.overrides))
+    fit = start(scene, dataset, scene.settings(None, ["cameras=auto", *args.overrides]))
     print("given:  ", described([v.camera for v in dataset.train], cameras, distance), flush=True)
     each = 0
     while fit.progress < 1:

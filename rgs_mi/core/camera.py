@@ -107,7 +107,7 @@ class Camera:
         to_world = np.eye(4)
         to_world[:3, :3], to_world[:3, 3] = (u @ vh).T, origin
         (fx, fy), principal = zoom * self.focal, self.principal + shift * self.focal
-        lens = Lens(*lens.tolist(), self.learned.reach)
+        lens = Lens(*lens.tolist(), reach=self.learned.reach)
         return Camera(to_world, (float(fx), float(fy)), (float(principal[0]), float(principal[1])), self.size, lens)
 
     @classmethod
@@ -195,7 +195,7 @@ def opaque(camera: Camera, width: int = 1) -> Projection:
         mi.Point3f(*map(scalar, camera.origin)),
         focal,
         principal,
-        camera.lens and Lens(*map(scalar, camera.lens.coefficients), scalar(camera.lens.reach)),
+        camera.lens and Lens(*map(scalar, camera.lens.coefficients), reach=scalar(camera.lens.reach)),
     )
 
 

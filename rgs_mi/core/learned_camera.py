@@ -46,7 +46,7 @@ class LearnedCamera:
 
         at = lambda k: dr.gather(mi.Float, self.values, dr.full(mi.UInt32, k, width), mode=dr.ReduceMode.Expand)
         v = [at(k) for k in range(_COUNT)]
-        lens = Lens(*v[16:20], dr.opaque(mi.Float, self.reach))
+        lens = Lens(*v[16:20], reach=dr.opaque(mi.Float, self.reach))
         return Numbers(
             mi.Matrix3f(v[0:3], v[3:6], v[6:9]), mi.Point3f(*v[9:12]), mi.Vector2f(*v[12:14]), mi.Vector2f(*v[14:16]), lens
         )

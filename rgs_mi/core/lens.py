@@ -59,7 +59,7 @@ class Lens:
         differentiable, which is the derivative of the implicit function."""
         import drjit as dr
 
-        plain = Lens(*map(dr.detach, self.coefficients), self.reach)
+        plain = Lens(*map(dr.detach, self.coefficients), reach=self.reach)
         goal = [dr.detach(v) for v in (x, y)]
         u, v = goal
         for _ in range(NEWTON - 1):

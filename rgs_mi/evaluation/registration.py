@@ -20,8 +20,9 @@ from ..shading import deferred
 from ..shading.lighting import Lighting
 from ..surfels.surfels import Surfels
 
-_LEVELS, _LEAST = (8, 4, 2, 1), 24  # pixels of a photograph's side that make one of a level's; its least height
-_STEPS = 6  # of Levenberg and Marquardt, at most, on each level
+#: Pixels of a photograph's side that make one of a level's: steps of Levenberg and Marquardt, at most.
+_LEVELS = {8: 6, 4: 6, 2: 6, 1: 4}
+_LEAST = 24  # pixels of a level's height
 _PROBE = 0.5  # pixels that differences of poses move a picture by
 _STILL = 0.02  # pixels: a step that moves a picture by less is the last
 _DAMPING = 1e-3  # of the diagonal, at first
@@ -63,11 +64,11 @@ def register(
     whole = registration.cameras.get(view.name, view.camera)
     pivot = np.median(surfels.numpy()["centers"], axis=0)
     numbers = np.zeros(len(POSE) + 3)
-    for downscale in _LEVELS:
-        if downscale > _LEVELS[-1] and view.camera.size[1] < _LEAST * downscale:
+    for downscale, steps in _LEVELS.items():
+        if downscale > 1 and view.camera.size[1] < _LEAST * downscale:
             continue
         problem = _Problem(registration, surfels, lighting, view, whole, pivot, background, downscale)
-        numbers = _minimized(problem, numbers)
+        numbers = _minimized(problem, numbers, steps)
     camera = _moved(whole, whole, pivot, numbers[: len(POSE)]).baked() if registration.poses else whole
     return Registered(camera, np.exp(numbers[len(POSE) :]) if registration.exposure else None)
 
@@ -127,11 +128,11 @@ class _Problem:
         return columns
 
 
-def _minimized(problem, numbers):
-    """Levenberg and Marquardt's method, from ``numbers``."""
+def _minimized(problem, numbers, steps):
+    """So many ``steps`` of Levenberg and Marquardt's method at most, from ``numbers``."""
     damping, picture = _DAMPING, problem.rendered(numbers)
     residuals = problem.residuals(picture, numbers)
-    for _ in range(_STEPS):
+    for _ in range(steps):
         jacobian = problem.jacobian(picture, numbers)
         normal, right = jacobian.T @ jacobian, jacobian.T @ residuals
         for _ in range(4):

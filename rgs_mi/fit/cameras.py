@@ -14,16 +14,18 @@ from ..settings.settings import Settings, Weights
 
 #: Names of what is learned: a row per view, per camera, and per view.
 POSES, LENSES, EXPOSURE = "poses", "intrinsics", "exposure"
-_POINTS, _NEAREST, _FLOOR = 500, 0.8, 1e-3  # of `_whitening`: points; most part of the distance; least eigenvalue
+_POINTS, _NEAREST, _DAMPING = 500, 0.8, 0.02  # of `_whitening`: points; the ball's radius over its distance, at most; λ
+_HOLD = 0.02  # of drift that a step takes out: all at once, surfels could not follow, and poses would fight for it
 _BETA = 0.9, 0.99  # of Adam; a row moves but some ten times in a fit, so its moments forget sooner than those of surfels
 
 
 class Rows:
     """Rows of numbers [N, K] that Adam moves one by one, each with its own count of steps: a row without a gradient stays
-    where it is, and so do its moments. On NumPy arrays, double precision: there are few."""
+    where it is, and so do its moments. The numbers of a row share the second moment (VectorAdam, Ling et al. 2022): what has
+    little gradient moves little, where Adam's own would make a random walk of it. On NumPy arrays: there are few."""
 
     def __init__(self, count: int, width: int) -> None:
-        self.value, self.m, self.v = (np.zeros((count, width)) for _ in range(3))
+        self.value, self.m, self.v = np.zeros((count, width)), np.zeros((count, width)), np.zeros((count, 1))
         self.steps = np.zeros(count, np.int64)
 
     def step(self, gradients: Mapping[int, np.ndarray], rate: float, bases: np.ndarray | None = None) -> None:
@@ -36,7 +38,7 @@ class Rows:
             gradient = basis.T @ gradient
             self.steps[row] += 1
             self.m[row] += (1 - _BETA[0]) * (gradient - self.m[row])
-            self.v[row] += (1 - _BETA[1]) * (gradient**2 - self.v[row])
+            self.v[row] += (1 - _BETA[1]) * (np.mean(gradient**2) - self.v[row])
             m, v = ((x[row]) / (1 - beta ** self.steps[row]) for x, beta in zip((self.m, self.v), _BETA))
             self.value[row] -= rate * basis @ (m / np.maximum(np.sqrt(v), 1e-15))
 
@@ -117,7 +119,7 @@ class Cameras:
 
     def step(self, rates: Mapping[str, float]) -> None:
         """Move what the views seen since the last step have gradients for, at the ``rates`` of `POSES`, `LENSES` and
-        `EXPOSURE`; then take out what surfels and light could follow: a similarity of the world, and a gain of all."""
+        `EXPOSURE`; then take out some of what surfels and light can follow: a similarity of the world, and a gain of all."""
         gradients: dict[str, dict[int, np.ndarray]] = {name: {} for name in self.rows}
         found = [[dr.grad(v) for v in leaf] for _, _, leaf in self._leaves]
         dr.eval(found)
@@ -125,13 +127,13 @@ class Cameras:
             gradient = np.array([float(v[0]) for v in leaf])
             gradients[name][row] = gradients[name].get(row, 0) + gradient
         self._leaves.clear()
-        for name, found in gradients.items():
-            self.rows[name].step(found, rates[name], self._bases if name == POSES else None)
-        if gradients.get(POSES):
+        for name, rows in gradients.items():
+            self.rows[name].step(rows, rates.get(name, 0.0), self._bases if name == POSES else None)
+        if POSES in self.rows:
             poses = self.rows[POSES].value
-            poses -= (self._modes @ (self._modes.T @ poses.ravel())).reshape(poses.shape)
+            poses -= _HOLD * (self._modes @ (self._modes.T @ poses.ravel())).reshape(poses.shape)
         if EXPOSURE in self.rows:
-            self.rows[EXPOSURE].value -= self.rows[EXPOSURE].value.mean(0)
+            self.rows[EXPOSURE].value -= _HOLD * self.rows[EXPOSURE].value.mean(0)
 
     # ---- What came out ----
 
@@ -194,9 +196,10 @@ def _similarities(cameras, pivot) -> np.ndarray:
 
 
 def _whitening(cameras, pivot, extent) -> np.ndarray:
-    """[V, 6, 6]: bases of poses in which each coordinate moves what is seen of the object by as much, a unit by 1 in x/z units
-    (root mean square), and none does what others do (CamP, Park et al. 2023): C^(−1/2), with C the mean of JᵀJ over the
-    visible side of a sphere of radius ``extent`` and J the derivatives of x/z and y/z by the pose.
+    """[V, 6, 6]: bases of poses in which coordinates move what is seen of the object by much the same, a unit by 1 in x/z units
+    (root mean square), and none does what others do (CamP, Park et al. 2023): (C + λ)^(−1/2), with C the mean of JᵀJ over the
+    visible side of a sphere of radius ``extent`` and J the derivatives of x/z and y/z by the pose. What hardly shows is no
+    farther off than what does, so λ keeps the steps short that look for it.
 
     A camera sees the near side of the object alone, which turning about its middle shifts as well: without this the shift
     would have to be found before the turn shows.
@@ -219,5 +222,5 @@ def _whitening(cameras, pivot, extent) -> np.ndarray:
         weight = np.where(depth > 0, cosine, 0)
         covariance = np.einsum("cni,cnj,n->ij", jacobian, jacobian, weight) / max(weight.sum(), 1e-9)
         size, vectors = np.linalg.eigh(covariance)
-        bases.append((vectors / np.sqrt(np.maximum(size, _FLOOR * size[-1]))) @ vectors.T)
+        bases.append((vectors / np.sqrt(size + _DAMPING * size[-1])) @ vectors.T)
     return np.array(bases)

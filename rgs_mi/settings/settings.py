@@ -80,13 +80,13 @@ class LearningRates:
     environment: Rates = Field(default=(6e-2, 5e-3), description="Of the environment's texels.")
     shader: Rates = Field(default=(1e-2, 1e-3), description="Of the network of `shader`.")
     poses: Rates = Field(
-        default=(2e-3, 5e-5), description="Of the cameras' poses: radians that what they show moves by in the picture."
+        default=(4e-3, 3e-5), description="Of the cameras' poses: radians that what they show moves by in the picture."
     )
     intrinsics: Rates = Field(
         default=(5e-5, 5e-6),
         description="Of focal lengths, principal points and distortion, relative to the picture's size.",
     )
-    exposure: Rates = Field(default=(2e-2, 1e-3), description="Of the photographs' exposure, natural logarithms of gains.")
+    exposure: Rates = Field(default=(5e-2, 1e-3), description="Of the photographs' exposure, natural logarithms of gains.")
 
 
 @dataclass(frozen=True, config=_MODEL)
@@ -249,7 +249,7 @@ class Settings:
         default=0.4, ge=0, le=1, description="Fraction of the fit from which view-dependent diffuse is learned."
     )
     cameras: Literal["auto", "fixed", "learned"] = Field(
-        default="auto",
+        default="fixed",
         description="Whether poses, focal lengths, principal points and distortion are learned; `auto`: of photographs, not of "
         "path-traced images.",
     )

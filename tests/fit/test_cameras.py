@@ -151,10 +151,11 @@ def test_gradients_through_what_is_reflected(lit):
 
 def test_rows_without_gradient_stay():
     rows = Rows(4, 3)
-    rows.step({1: np.array([1.0, -2.0, 1e-3])}, 0.1)
-    assert np.allclose(rows.value[1], [-0.1, 0.1, -0.1], rtol=1e-6)  # Adam's first step is as long as its rate
+    rows.step({1: np.array([1.0, -2.0, 2.0])}, 0.1)
+    first = -0.1 * np.array([1, -2, 2]) / np.sqrt(3)  # Adam's first step is as long as its rate
+    assert np.allclose(rows.value[1], first)
     rows.step({1: np.array([np.nan, 1, 1]), 2: np.ones(3)}, 0.1)
-    assert not rows.value[[0, 3]].any() and np.allclose(rows.value[1:3], [[-0.1, 0.1, -0.1], [-0.1] * 3])
+    assert not rows.value[[0, 3]].any() and np.allclose(rows.value[1:3], [first, [-0.1] * 3])
 
 
 def test_similarities_of_the_world_are_invisible():
@@ -204,7 +205,7 @@ def test_poses_and_exposures_come_back():
 
 
 def test_gauge(dataset):
-    """However views pull, the world stays, and so does the mean of the gains."""
+    """However views pull, the world comes back, and so does the mean of the gains."""
     cameras, rng = Cameras([v.camera for v in dataset.train], 1.0, True, True), np.random.default_rng(0)
     for view in (0, 3, 5, 1):
         s = cameras.see(view, dataset.train[view].camera, SETTINGS.weights)
@@ -212,16 +213,21 @@ def test_gauge(dataset):
         dr.backward(sum(v * float(w) for v, w in zip(pulled, rng.normal(size=6))) + s.prior)
         cameras.step({POSES: 1e-2, LENSES: 1e-3, EXPOSURE: 1e-2})
     assert np.abs(cameras.rows[POSES].value).max() > 3e-3 and np.abs(cameras.rows[EXPOSURE].value).max() > 3e-3
-    assert np.abs(cameras._modes.T @ cameras.rows[POSES].value.ravel()).max() < 1e-12
-    assert np.abs(cameras.rows[EXPOSURE].value.mean(0)).max() < 1e-12
+    poses, gains = (cameras.rows[name].value for name in (POSES, EXPOSURE))
+    drift = lambda: np.abs(cameras._modes.T @ poses.ravel()).max() + np.abs(gains.mean(0)).max()
+    others = lambda: poses.ravel() - cameras._modes @ (cameras._modes.T @ poses.ravel())
+    before, kept = drift(), others()
+    for _ in range(200):
+        cameras.step({})
+    assert drift() < 0.03 * before and before > 1e-3 and np.allclose(others(), kept)
 
 
 def test_who_learns(dataset):
     photographs = replace(dataset, photographed=True)
     rows = lambda *arguments: set(c.rows) if (c := Cameras.of(*arguments, 1.0)) else None
     assert rows(dataset, SETTINGS) is None
-    assert rows(photographs, SETTINGS) == {POSES, LENSES, EXPOSURE}
-    assert rows(photographs, replace(SETTINGS, cameras="fixed")) == {EXPOSURE}
+    assert rows(photographs, replace(SETTINGS, cameras="auto")) == {POSES, LENSES, EXPOSURE}
+    assert rows(photographs, SETTINGS) == {EXPOSURE}
     assert rows(photographs, replace(SETTINGS, cameras="fixed", exposure="fixed")) is None
     assert rows(dataset, replace(SETTINGS, cameras="learned")) == {POSES, LENSES}
 
@@ -242,7 +248,7 @@ def test_views_of_one_camera_share_its_intrinsics(dataset):
 
 def test_checkpoints_hold_cameras(dataset):
     photographs = replace(dataset, photographed=True)
-    settings = replace(SETTINGS, cameras_start=0.0)
+    settings = replace(SETTINGS, cameras="learned", cameras_start=0.0)
     fit = Fit(photographs, model(), settings, 1.0)
     for _ in range(8):
         fit.step()
@@ -255,7 +261,7 @@ def test_checkpoints_hold_cameras(dataset):
 
 def test_no_kernel_is_compiled_again(dataset):
     """Poses, gains and rates differ from step to step."""
-    fit = Fit(replace(dataset, photographed=True), model(), replace(SETTINGS, cameras_start=0.0), 1.0)
+    fit = Fit(replace(dataset, photographed=True), model(), replace(SETTINGS, cameras="learned", cameras_start=0.0), 1.0)
     for _ in range(9):
         fit.step()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
