@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -22,12 +22,29 @@ from .curves import Curves
 from .density import DensityControl
 from .model import ENVIRONMENT, Model
 from .objective import Objective
-from .plan import LEAST_STEPS
+from .plan import LEAST_STEPS, STEPS
 from .schedule import Schedule
 
 _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
 _PACE = 31  # steps whose median says how long one takes
 _DIVERGED = 10  # steps in a row without a finite error
+
+
+@dataclass
+class _Level:
+    """The level of the pyramid that a fit is at: its ``stage``, the ``steps`` there, and the ``seconds`` of the last ones."""
+
+    stage: Stage
+    steps: int = 0
+    seconds: deque[float] = field(default_factory=lambda: deque(maxlen=_PACE))
+
+    def note(self, seconds: float) -> None:
+        self.steps += 1
+        self.seconds.append(seconds)
+
+    def meta(self) -> dict:
+        """What a checkpoint keeps."""
+        return {"downscale": self.stage.downscale, "steps": self.steps, "seconds": list(self.seconds)}
 
 
 class Fit:
@@ -57,8 +74,7 @@ class Fit:
         self.photographs: Photographs | None = None  # of the stage that has begun
         self.step_number, self.views_used, self.elapsed = 0, 0, 0.0
         self.psnr, self._failures = 0.0, 0
-        self._stage: Stage | None = None
-        self._seconds: deque[float] = deque(maxlen=_PACE)  # of the last steps of the stage
+        self._level: _Level | None = None
         # Of some steps ago: what reflected rays meet, what surfels hide of the light, and what samples the light
         self.proxies: Proxies | None = None
         self.irradiance_visibility: mi.Color3f | None = None
@@ -71,6 +87,7 @@ class Fit:
         gradients = self.density.gradients
         arrays = {"gradient_sum": gradients.sum.numpy(), "gradient_count": gradients.count.numpy()}
         meta = {"step": self.step_number, "views_used": self.views_used, "elapsed": self.elapsed, "extent": self.extent}
+        meta["level"] = self._level and self._level.meta()
         if self.cameras:
             arrays |= self.cameras.state()
         return self.model.state() | arrays, meta | {"curves": self.curves.rows}
@@ -85,9 +102,9 @@ class Fit:
         if fit.cameras:
             fit.cameras.restore(arrays)
         fit.curves = Curves(meta["curves"])
-        if level := meta.get("level"):
-            fit._stage = next((s for s in settings.stages or () if s.downscale == level["downscale"]), None)
-            fit._seconds.append(level["seconds"])
+        if level := meta["level"]:
+            stage = next((s for s in settings.stages or () if s.downscale == level["downscale"]), None)
+            fit._level = stage and _Level(stage, level["steps"], deque(level["seconds"], _PACE))
         return fit
 
     @property
@@ -102,14 +119,15 @@ class Fit:
 
     @property
     def stage(self) -> Stage:
-        """The level of the pyramid in use: that of the schedule, in a fit that minutes bound after `STEPS` of the level before,
-        and if there is time for `LEAST_STEPS`."""
-        stage, now, minutes = self.schedule.stage(self.progress), self._level, self.settings.minutes
-        if now is None or self.settings.iterations or minutes is None or stage.downscale >= now.stage.downscale:
-            return stage
-        pixels = (now.stage.downscale / stage.downscale) ** 2 * stage.views / now.stage.views
-        affordable = 60 * minutes - self.elapsed > LEAST_STEPS * pixels * now.pace
-        return stage if affordable and now.steps >= STEPS else now.stage
+        """The level of the pyramid in use: that of the schedule; in a fit that minutes bound, level by level, each after
+        `STEPS` of the one before and if there is time for `LEAST_STEPS`."""
+        planned, now, s = self.schedule.stage(self.progress), self._level, self.settings
+        if now is None or s.iterations or s.minutes is None or planned.downscale >= now.stage.downscale:
+            return planned
+        finer = max((stage for stage in s.stages or () if stage.downscale < now.stage.downscale), key=lambda x: x.downscale)
+        pixels = (now.stage.downscale / finer.downscale) ** 2 * finer.views / now.stage.views
+        affordable = 60 * s.minutes - self.elapsed > LEAST_STEPS * pixels * np.median(now.seconds)
+        return finer if affordable and now.steps >= STEPS else now.stage
 
     @property
     def sh_order(self) -> int:
@@ -164,8 +182,8 @@ class Fit:
         has another row."""
         start, pixels, progress = time.monotonic(), self.pixels, self.progress
         stage = self.stage
-        if stage != self._stage:
-            self._stage, self._seconds = stage, deque([self._seconds[-1]] if self._seconds else [], _PACE)
+        if self._level is None or stage != self._level.stage:
+            self._level = _Level(stage)
         if self.photographs is None or self.photographs.downscale != stage.downscale:
             self.photographs = Photographs(self.dataset.train, stage.downscale, self.settings.background, self.priors)
         self._follow_schedule()
@@ -187,7 +205,7 @@ class Fit:
         self._control_density()
         seconds = time.monotonic() - start
         self.elapsed += seconds
-        self._seconds.append(seconds)
+        self._level.note(seconds)
         state = {"step": self.step_number, "seconds": self.elapsed, "surfels": len(self.model), "pixels": pixels}
         return self.curves.add(self.progress, state, {"psnr": self.psnr, "ms": 1e3 * seconds} | mean)
 
