@@ -15,6 +15,7 @@ from ..core.files import atomic_file
 from ..datasets import is_capture, looked_for
 from ..datasets.types import View
 from ..fit import checkpoint
+from ..fit.plan import agree
 from ..fit.scene import FitScene
 from ..report import results
 from ..report.tables import DETAILS, FIGURES, csv_text
@@ -44,7 +45,7 @@ class Job:
 
     def has(self, saved: dict) -> bool:
         """Return whether the settings ``saved`` with a fit are this job's."""
-        return saved == self.settings
+        return agree(self.settings, saved)
 
     def figures(self) -> dict | None:
         """Return what metrics.json of the finished fit holds; None where there is none, or one with other settings."""

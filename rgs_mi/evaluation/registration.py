@@ -22,7 +22,7 @@ from ..surfels.surfels import Surfels
 
 #: Pixels of a photograph's side that make one of a level's: steps of Levenberg and Marquardt, at most.
 _LEVELS = {8: 6, 4: 6, 2: 6, 1: 4}
-_LEAST = 24  # pixels of a level's height
+_LEAST, _MOST = 24, 500  # pixels of a level's height, and of its longer side: more tell a pose hardly better
 _PROBE = 0.5  # pixels that differences of poses move a picture by
 _STILL = 0.02  # pixels: a step that moves a picture by less is the last
 _DAMPING = 1e-3  # of the diagonal, at first
@@ -65,7 +65,9 @@ def register(
     pivot = np.median(surfels.numpy()["centers"], axis=0)
     numbers = np.zeros(len(POSE) + 3)
     for downscale, steps in _LEVELS.items():
-        if downscale > 1 and view.camera.size[1] < _LEAST * downscale:
+        small = downscale > 1 and view.camera.size[1] < _LEAST * downscale
+        large = downscale < max(_LEVELS) and max(view.camera.size) > _MOST * downscale
+        if small or large:
             continue
         problem = _Problem(registration, surfels, lighting, view, whole, pivot, background, downscale)
         numbers = _minimized(problem, numbers, steps)

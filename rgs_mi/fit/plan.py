@@ -1,6 +1,7 @@
 """What a fit does of itself where settings leave it open: how many surfels, and how far up the pyramid, for these photographs in
 this time."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,8 @@ from ..settings.settings import Settings, Stage
 _SURFELS, _SURFELS_A_MINUTE = 50_000, (5_000, 15_000)  # at least; a minute at least, and at most
 _FIRST = 25_000  # surfels to start with, at least
 _COARSEST, _FINEST_FROM = 200, 0.2  # pixels along the longer side, about; the part of the fit before full resolution
-STEPS, LEAST_STEPS = 1000, 250  # of a level before the next; that the next must have time for
+STEPS = 500, 1000  # of a level before the next: of one below half resolution, and of that
+LEAST_STEPS = 250, 1000  # that there must be time for at the next: at half resolution and below, and at full resolution
 
 
 def planned(settings: Settings, dataset: Dataset) -> Settings:
@@ -37,6 +39,21 @@ def planned(settings: Settings, dataset: Dataset) -> Settings:
         initialization=replace(settings.initialization, surfels=first),
         stages=stages,
     )
+
+
+def agree(asked: Mapping, saved: Mapping) -> bool:
+    """Return whether the settings ``saved`` with a fit, nested dicts, are those ``asked`` for, but for what they leave open."""
+    open_ = lambda tree: (tree["density"]["max_surfels"], tree["initialization"]["surfels"], tree["stages"])
+    try:
+        chosen = [there if own is None else own for own, there in zip(open_(asked), open_(saved))]
+    except (KeyError, TypeError):
+        return False
+    return saved == {
+        **asked,
+        "density": {**asked["density"], "max_surfels": chosen[0]},
+        "initialization": {**asked["initialization"], "surfels": chosen[1]},
+        "stages": chosen[2],
+    }
 
 
 def _foreground(view: View) -> float:

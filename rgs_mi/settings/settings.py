@@ -250,8 +250,7 @@ class Settings:
     )
     cameras: Literal["auto", "fixed", "learned"] = Field(
         default="fixed",
-        description="Whether poses, focal lengths, principal points and distortion are learned; `auto`: of photographs, not of "
-        "path-traced images.",
+        description="Whether poses, focal lengths, principal points and distortion are learned; `auto`: of photographs alone.",
     )
     cameras_start: float = Field(
         default=0.1,
@@ -260,7 +259,7 @@ class Settings:
         description="Fraction of the fit from which cameras are learned: at first surfels are too wrong.",
     )
     exposure: Literal["auto", "fixed", "learned"] = Field(
-        default="auto",
+        default="fixed",
         description="Whether exposure and white balance of each photograph are learned; `auto` as for `cameras`.",
     )
     checkpoint_seconds: float = Field(default=20.0, ge=0, le=1e6, description="Seconds from one checkpoint to the next.")
