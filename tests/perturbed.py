@@ -16,7 +16,7 @@ from rgs_mi.commands.optimize import start
 from rgs_mi.core.alignment import pose_errors
 from rgs_mi.core.camera import focus_point
 from rgs_mi.datasets import load_dataset
-from rgs_mi.fit.scene import FitScene
+from rgs_mi.fit.scene import PHOTOGRAPHS, FitScene
 from rgs_mi.report import results
 
 from captures import perturbed
@@ -56,7 +56,7 @@ def main():
     cameras = [view.camera for view in truth.train]
     center, _ = focus_point(cameras)
     distance = float(np.mean([np.linalg.norm(c.origin - center) for c in cameras]))
-    fit = start(scene, dataset, scene.settings(None, ["cameras=auto", *args.overrides]))
+    fit = start(scene, dataset, scene.settings(PHOTOGRAPHS, args.overrides))
     print("given:  ", described([v.camera for v in dataset.train], cameras, distance), flush=True)
     each = 0
     while fit.progress < 1:

@@ -113,7 +113,7 @@ def plan(
     found, known = find_scenes(suite), known_variants()
     check_names("scene", scenes, found)
     check_names("variant", variants, known)
-    template = FitScene.load(xml, next(iter(found.values())))
+    scenes_to_fit = {scene: FitScene.load(xml, data) for scene, data in found.items()}
     jobs = []
     listed = dict.fromkeys([*VARIANTS, *(variants or ())])
     for seed, (k, scene), name in itertools.product(dict.fromkeys(seeds), enumerate(found), listed):
@@ -128,7 +128,7 @@ def plan(
                 seed,
                 variant.preset,
                 changes,
-                to_dict(template.settings(variant.preset, changes)),
+                to_dict(scenes_to_fit[scene].settings(variant.preset, changes)),
                 Path(out) / scene / (f"{name}-{seed}" if seed else name),
                 asked=wanted and (not scenes or scene in scenes),
             )

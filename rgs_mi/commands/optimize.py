@@ -20,7 +20,7 @@ from ..datasets.types import Dataset
 from ..fit import checkpoint
 from ..fit.events import Events
 from ..fit.model import Model
-from ..fit.plan import planned
+from ..fit.plan import planned, told
 from ..fit.scene import FitScene
 from ..fit.trainer import Fit
 from ..priors import depth_priors
@@ -67,8 +67,8 @@ def optimize(
     dataset = scene.dataset(settings.resolution, quiet)
     make_folder(folder)
     fit = _resume(saved, scene, dataset, settings) if saved else start(scene, dataset, settings, quiet)
-    if fit.cameras and not quiet:
-        print(_told(fit.cameras))
+    if not quiet:
+        print(told(fit.settings, dataset))
     try:
         stopped = _loop(fit, folder, quiet, events)
     finally:
@@ -83,14 +83,6 @@ def optimize(
 def budget(minutes: float | None) -> list[str]:
     """Return the overrides that plan a fit to end within ``minutes``; none for None."""
     return [f"minutes={minutes}", "iterations=null"] if minutes is not None else []
-
-
-def _told(cameras) -> str:
-    """What is learned of cameras, in a line."""
-    names = {"cameras": "poses" in cameras.rows, "exposure": "exposure" in cameras.rows}
-    what = [name for name, wanted in names.items() if wanted]
-    remedy = " ".join(f"--set {name}=fixed" for name in what)
-    return f"photographs: {', '.join(what)} {'is' if what == ['exposure'] else 'are'} learned ({remedy} keeps what is given)"
 
 
 # ---- Start ----

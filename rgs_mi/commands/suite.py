@@ -44,16 +44,16 @@ def plan(
     found = find_scenes(root)
     check_names("scene", scenes, found)
     overrides = (*overrides, *budget(minutes))
-    settings = to_dict(FitScene.load(xml, next(iter(found.values()))).settings(config, overrides))
+    settings = {scene: to_dict(FitScene.load(xml, data).settings(config, overrides)) for scene, data in found.items()}
     return [
         Job(
             scene,
             data,
             Path(config).stem if config else "default",
-            settings["seed"],
+            settings[scene]["seed"],
             config,
             overrides,
-            settings,
+            settings[scene],
             Path(out) / scene,
             asked=not scenes or scene in scenes,
         )

@@ -1,6 +1,7 @@
 """Photographs and their cameras: a folder in, lists of `View` out."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from ..core.errors import UserError
@@ -22,13 +23,18 @@ def load_dataset(root: str | Path, longest: int = LONGEST, quiet: bool = True) -
     root = Path(root)
     if not root.is_dir():
         raise UserError(f"data folder '{root}' does not exist: give a capture's folder with --data")
-    for layout in _LAYOUTS:
-        if layout.found(root):
-            dataset = layout.load(root, longest)
-            if not quiet:
-                _tell_scaled(dataset, longest)
-            return dataset
-    raise UserError(f"data folder '{root}' has no layout that is known: looked for {looked_for()}")
+    layout = _layout(root)
+    if layout is None:
+        raise UserError(f"data folder '{root}' has no layout that is known: looked for {looked_for()}")
+    dataset = replace(layout.load(root, longest), photographed=layout.PHOTOGRAPHED)
+    if not quiet:
+        _tell_scaled(dataset, longest)
+    return dataset
+
+
+def _layout(root):
+    """The first layout that the folder ``root`` has, or None."""
+    return next((layout for layout in _LAYOUTS if layout.found(root)), None)
 
 
 def _tell_scaled(dataset, longest):
@@ -44,7 +50,14 @@ def _tell_scaled(dataset, longest):
 
 def is_capture(root: Path) -> bool:
     """Return whether ``root`` is a folder with one of the layouts of `load_dataset`; what is in its files is not asked."""
-    return root.is_dir() and any(layout.found(root) for layout in _LAYOUTS)
+    return root.is_dir() and _layout(root) is not None
+
+
+def is_photographed(root: Path) -> bool:
+    """Return whether ``root`` is a folder whose layout is one of photographs (`Dataset.photographed`); its files are not
+    read."""
+    layout = _layout(root) if root.is_dir() else None
+    return layout is not None and layout.PHOTOGRAPHED
 
 
 def looked_for() -> str:

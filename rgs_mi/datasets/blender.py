@@ -21,6 +21,7 @@ from .types import Dataset
 
 TRAIN, TEST = "transforms_train.json", "transforms_test.json"
 LOOKED_FOR = f"{TRAIN} (Blender)"
+PHOTOGRAPHED = False
 
 
 def found(root: Path) -> bool:

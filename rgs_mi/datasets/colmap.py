@@ -24,6 +24,7 @@ from .types import Dataset
 
 FOLDERS = ("sparse/0", "sparse", ".", "colmap/sparse/0")
 LOOKED_FOR = f"cameras and images (.bin or .txt) in {', '.join(FOLDERS)} (COLMAP)"
+PHOTOGRAPHED = True
 _REMEDY = "COLMAP's pose must be a rotation and a near translation"
 
 
@@ -56,7 +57,6 @@ def load(root: Path, longest: int = LONGEST) -> Dataset:
         points=points,
         point_colors=colors,
         root=root,
-        photographed=True,
     )
 
 

@@ -24,6 +24,7 @@ from .types import Dataset
 
 FILE, COLUMNS = "poses_bounds.npy", 17
 LOOKED_FOR = f"{FILE} (LLFF)"
+PHOTOGRAPHED = True
 _REMEDY = "a row is a 3 x 5 matrix of a rigid pose and (height, width, focal length), then two depths"
 
 
@@ -58,7 +59,6 @@ def load(root: Path, longest: int = LONGEST) -> Dataset:
         points=points,
         point_colors=colors,
         root=root,
-        photographed=True,
     )
 
 

@@ -29,6 +29,7 @@ from .types import Dataset
 
 FILE = "transforms.json"
 LOOKED_FOR = f"{FILE} (nerfstudio)"
+PHOTOGRAPHED = True
 COLMAP_POINTS = ("colmap/sparse/0/points3D.bin", "colmap/sparse/0/points3D.txt")
 _EXCHANGE = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 
@@ -50,7 +51,7 @@ def load(root: Path, longest: int = LONGEST) -> Dataset:
     kept, held_out = _split(file, meta, frames)
     points, colors = _points(file, meta) or (None, None)
     views = load_split(file, kept, held_out, longest)
-    return Dataset(**views, points=points, point_colors=colors, root=root, photographed=True)
+    return Dataset(**views, points=points, point_colors=colors, root=root)
 
 
 def _frame(file: Path, meta: dict, index: int, longest: int) -> Frame:

@@ -25,6 +25,7 @@ from .types import Dataset
 
 CAMERA, DEPTH, SPLIT = "-camera.pkl", "-depth.png", "synthetic_split_128.pkl"
 LOOKED_FOR = f"*{CAMERA} (NeRO)"
+PHOTOGRAPHED = False  # NeRO's photographs have a path-traced sibling in the same layout
 _DEPTH_RANGE, _BACKGROUND = 15.0, 14.5
 _REMEDY = "a camera is a pickle of a rigid world-to-camera matrix [3, 4] and K [3, 3]"
 
@@ -48,7 +49,6 @@ def load(root: Path, longest: int = LONGEST) -> Dataset:
         points=points,
         point_colors=colors,
         root=root,
-        photographed=False,
     )
 
 

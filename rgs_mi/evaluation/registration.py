@@ -21,7 +21,7 @@ from ..shading.lighting import Lighting
 from ..surfels.surfels import Surfels
 
 #: Pixels of a photograph's side that make one of a level's: steps of Levenberg and Marquardt, at most.
-_LEVELS = {8: 6, 4: 6, 2: 6, 1: 4}
+_LEVELS = {4: 6, 2: 6, 1: 6}
 _LEAST, _MOST = 24, 500  # pixels of a level's height, and of its longer side: more tell a pose hardly better
 _PROBE = 0.5  # pixels that differences of poses move a picture by
 _STILL = 0.02  # pixels: a step that moves a picture by less is the last
@@ -58,7 +58,8 @@ def register(
     """Fit pose and exposure of ``view`` to the left half of its photograph, coarse to fine, in least squares of display values
     over the grey level ``background``.
 
-    The pose is that of `learned_camera` about the middle of the surfels. Its derivatives are central differences of half a
+    Each level goes on from the one before, or from the pose as given where that is nearer. The pose is that of `learned_camera`
+    about the middle of the surfels. Its derivatives are central differences of half a
     pixel: what is that far off is what counts, and no derivative kernels are compiled for it.
     """
     whole = registration.cameras.get(view.name, view.camera)
@@ -70,6 +71,8 @@ def register(
         if small or large:
             continue
         problem = _Problem(registration, surfels, lighting, view, whole, pivot, background, downscale)
+        # A coarse level may lead astray: surfels are hardly seen there as photographs are shrunk
+        numbers = min((numbers, np.r_[np.zeros(len(POSE)), numbers[len(POSE) :]]), key=problem.error)
         numbers = _minimized(problem, numbers, steps)
     camera = _moved(whole, whole, pivot, numbers[: len(POSE)]).baked() if registration.poses else whole
     return Registered(camera, np.exp(numbers[len(POSE) :]) if registration.exposure else None)
@@ -114,6 +117,10 @@ class _Problem:
         straight = color * np.exp(numbers[len(POSE) :]) / np.maximum(alpha, 1e-6)
         shown = srgb_encode(np.clip(straight, 0, 1)) * alpha + self.background * (1 - alpha)
         return (np.clip(shown, 0, 1) - self.target).ravel()
+
+    def error(self, numbers):
+        """The sum of squared residuals."""
+        return np.square(self.residuals(self.rendered(numbers), numbers)).sum()
 
     def jacobian(self, picture, numbers):
         """[3 P, 9], zero in what is not fitted."""

@@ -16,16 +16,16 @@ from ..settings.settings import Settings, Weights
 POSES, LENSES, EXPOSURE = "poses", "intrinsics", "exposure"
 _POINTS, _NEAREST, _DAMPING = 500, 0.8, 0.02  # of `_whitening`: points; the ball's radius over its distance, at most; λ
 _HOLD = 0.02  # of drift that a step takes out: all at once, surfels could not follow, and poses would fight for it
-_BETA = 0.9, 0.99  # of Adam; a row moves but some ten times in a fit, so its moments forget sooner than those of surfels
+_BETA = 0.8, 0.99  # of Adam; a row moves but some ten times in a fit, so its first moment forgets sooner than surfels'
 
 
 class Rows:
-    """Rows of numbers [N, K] that Adam moves one by one, each with its own count of steps: a row without a gradient stays
-    where it is, and so do its moments. The numbers of a row share the second moment (VectorAdam, Ling et al. 2022): what has
-    little gradient moves little, where Adam's own would make a random walk of it. On NumPy arrays: there are few."""
+    """Rows of numbers [N, K] that Adam moves one by one: a row without a gradient stays where it is. All share one second
+    moment (as the numbers of a vector do in VectorAdam, Ling et al. 2022): what has little gradient, a number or a row that is
+    right already, moves little, where Adam's own would make a random walk of it. On NumPy arrays: there are few."""
 
     def __init__(self, count: int, width: int) -> None:
-        self.value, self.m, self.v = np.zeros((count, width)), np.zeros((count, width)), np.zeros((count, 1))
+        self.value, self.m, self.v = np.zeros((count, width)), np.zeros((count, width)), np.zeros(())
         self.steps = np.zeros(count, np.int64)
 
     def step(self, gradients: Mapping[int, np.ndarray], rate: float, bases: np.ndarray | None = None) -> None:
@@ -38,9 +38,9 @@ class Rows:
             gradient = basis.T @ gradient
             self.steps[row] += 1
             self.m[row] += (1 - _BETA[0]) * (gradient - self.m[row])
-            self.v[row] += (1 - _BETA[1]) * (np.mean(gradient**2) - self.v[row])
-            m, v = ((x[row]) / (1 - beta ** self.steps[row]) for x, beta in zip((self.m, self.v), _BETA))
-            self.value[row] -= rate * basis @ (m / np.maximum(np.sqrt(v), 1e-15))
+            self.v = self.v + (1 - _BETA[1]) * (np.mean(gradient**2) - self.v)
+            m, v = self.m[row] / (1 - _BETA[0] ** self.steps[row]), self.v / (1 - _BETA[1] ** self.steps.sum())
+            self.value[row] -= rate * basis @ (m / max(np.sqrt(v), 1e-15))
 
     def state(self) -> dict[str, np.ndarray]:
         """Return all arrays, for a checkpoint."""
@@ -67,11 +67,13 @@ class Cameras:
 
     ``rows``: `POSES` [V, 6] and `LENSES` [C, 8], the numbers of `learned_camera`, where cameras are learned, and `EXPOSURE`
     [V, 3], natural logarithms of gains, where exposures are. Views whose intrinsics are the same share a camera. ``pivot``
-    [3] is the point that the cameras look at, about which they turn; ``extent`` is the object's radius in world units.
+    [3] is the point that the cameras look at, about which they turn; ``extent`` is the object's radius in world units; ``pixel``
+    is how many radians a pixel of the photographs is, in the mean.
     """
 
     def __init__(self, cameras: Sequence[Camera], extent: float, learn_cameras: bool, learn_exposure: bool) -> None:
         self.given = list(cameras)
+        self.pixel = float(np.mean([1 / np.mean(camera.focal) for camera in self.given]))  # radians, of whole photographs
         self.pivot, _ = focus_point(self.given)
         kinds = list(dict.fromkeys(map(_kind, self.given)))
         self._kinds = {kind: k for k, kind in enumerate(kinds)}
@@ -88,7 +90,7 @@ class Cameras:
     def of(cls, dataset: Dataset, settings: Settings, extent: float) -> "Cameras | None":
         """The corrections that ``settings`` ask for, of photographs of an object of radius ``extent`` in world units; None
         where nothing is learned."""
-        cameras, exposure = learned(dataset, settings)
+        cameras, exposure = settings.cameras == "learned", settings.exposure == "learned"
         if not (cameras or exposure):
             return None
         return cls([view.camera for view in dataset.train], extent, cameras, exposure)
@@ -166,12 +168,6 @@ class Cameras:
             prefix = f"cameras.{name}."
             if f"{prefix}value" in arrays:
                 rows.restore({k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)})
-
-
-def learned(dataset: Dataset, settings: Settings) -> tuple[bool, bool]:
-    """Return whether cameras and exposures are learned: as ``settings`` say, of themselves (``auto``) for photographs only."""
-    wanted = lambda setting: dataset.photographed if setting == "auto" else setting == "learned"
-    return wanted(settings.cameras), wanted(settings.exposure)
 
 
 def _kind(camera):

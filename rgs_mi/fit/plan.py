@@ -41,6 +41,24 @@ def planned(settings: Settings, dataset: Dataset) -> Settings:
     )
 
 
+def told(settings: Settings, dataset: Dataset) -> str:
+    """Return what the fit takes ``dataset`` for, and the settings that follow from it, in a line."""
+    width, height = dataset.train[0].camera.size
+    masked = sum(view.masked for view in dataset.train)
+    masks = "with masks" if masked == len(dataset.train) else f"{masked} of them with masks" if masked else "without masks"
+    kind = "photographs" if dataset.photographed else "images of known cameras"
+    chosen = {
+        "cameras": settings.cameras,
+        "exposure": settings.exposure,
+        "density.max_surfels": settings.density.max_surfels,
+    }
+    return (
+        f"{len(dataset.train)} {kind} of {width} x {height} pixels, {masks}, and {len(dataset.test)} held out: "
+        + ", ".join(f"{name}={value}" for name, value in chosen.items())
+        + " (--set changes it)"
+    )
+
+
 def agree(asked: Mapping, saved: Mapping) -> bool:
     """Return whether the settings ``saved`` with a fit, nested dicts, are those ``asked`` for, but for what they leave open."""
     open_ = lambda tree: (tree["density"]["max_surfels"], tree["initialization"]["surfels"], tree["stages"])

@@ -9,7 +9,7 @@ from ..core.camera import Camera
 from ..core.errors import UserError
 from ..core.runtime import cache_folder
 from ..core.scene_files import load_scene
-from ..datasets import load_dataset
+from ..datasets import is_photographed, load_dataset
 from ..datasets.path_traced import render_dataset
 from ..datasets.resolution import LONGEST
 from ..datasets.types import Dataset
@@ -19,6 +19,7 @@ from ..settings.settings import Settings
 from ..shading.environment import Environment
 from ..shading.lighting import Shading
 
+PHOTOGRAPHS = "photographs"  # the preset of what is photographed, not path-traced
 _ENVIRONMENTS = ("envmap", "procedural_envmap", "constant")
 
 
@@ -99,10 +100,12 @@ class FitScene:
         return given.stem if given.suffix == ".xml" else given.name
 
     def settings(self, config: str | Path | None = None, overrides: Sequence[str] = ()) -> Settings:
-        """Return the settings: defaults, over them the YAML beside the scene, ``config`` (a preset or file), and
-        ``overrides`` ('a.b=value'). Raises: UserError as `load_config` does."""
+        """Return the settings: defaults, over them those of the preset `PHOTOGRAPHS` where it is photographs that are
+        fitted, the YAML beside the scene, ``config`` (a preset or file), and ``overrides`` ('a.b=value'). Raises: UserError as
+        `load_config` does."""
         beside = self.path.with_suffix(".yaml")
-        sources = [beside.absolute()] if beside.is_file() else []
+        sources = [PHOTOGRAPHS] if is_photographed(self.photographs) else []
+        sources += [beside.absolute()] if beside.is_file() else []
         settings = load_config(Settings, [*sources, *([config] if config else [])], overrides)
         if settings.minutes is None and settings.iterations is None:
             raise UserError("settings: minutes and iterations are both null: give one of them, which bounds the fit")

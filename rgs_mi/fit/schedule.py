@@ -94,11 +94,11 @@ class Schedule:
             rates |= {name: _HELD * rates[name] for name in _NORMALS}
         return {name: rate * self._cooled(progress) for name, rate in rates.items()}
 
-    def camera_rates(self, progress: float) -> dict[str, float]:
-        """Adam's rate of each kind of `fit.cameras.Cameras.rows`."""
-        rates = self.settings.learning_rates
+    def camera_rates(self, progress: float, pixel: float) -> dict[str, float]:
+        """Adam's rate of each kind of `fit.cameras.Cameras.rows`; a ``pixel`` of the images in use is so many radians."""
+        rates, unit = self.settings.learning_rates, {"poses": pixel}
         return {
-            name: self.value(getattr(rates, name), progress) * self._cooled(progress)
+            name: self.value(getattr(rates, name), progress) * unit.get(name, 1) * self._cooled(progress)
             for name in ("poses", "intrinsics", "exposure")
         }
 

@@ -198,7 +198,7 @@ class Fit:
             measured.append({"loss.environment_tv": dr.detach(loss)})
         self.model.optimizer.step()
         if self.cameras:
-            self.cameras.step(self.schedule.camera_rates(progress))
+            self.cameras.step(self.schedule.camera_rates(progress, stage.downscale * self.cameras.pixel))
         dr.eval(measured)
         mean = {name: np.mean([float(m[name][0]) for m in measured if name in m]) for m in measured for name in m}
         self._judge(mean.pop("error"))

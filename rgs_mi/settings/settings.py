@@ -80,7 +80,7 @@ class LearningRates:
     environment: Rates = Field(default=(6e-2, 5e-3), description="Of the environment's texels.")
     shader: Rates = Field(default=(1e-2, 1e-3), description="Of the network of `shader`.")
     poses: Rates = Field(
-        default=(4e-3, 3e-5), description="Of the cameras' poses: radians that what they show moves by in the picture."
+        default=(0.2, 0.01), description="Of the cameras' poses: pixels of the images in use that what they show moves by."
     )
     intrinsics: Rates = Field(
         default=(5e-5, 5e-6),
@@ -248,9 +248,9 @@ class Settings:
     sh_start: float = Field(
         default=0.4, ge=0, le=1, description="Fraction of the fit from which view-dependent diffuse is learned."
     )
-    cameras: Literal["auto", "fixed", "learned"] = Field(
+    cameras: Literal["fixed", "learned"] = Field(
         default="fixed",
-        description="Whether poses, focal lengths, principal points and distortion are learned; `auto`: of photographs alone.",
+        description="Whether poses, focal lengths, principal points and distortion are learned.",
     )
     cameras_start: float = Field(
         default=0.1,
@@ -258,9 +258,9 @@ class Settings:
         le=1,
         description="Fraction of the fit from which cameras are learned: at first surfels are too wrong.",
     )
-    exposure: Literal["auto", "fixed", "learned"] = Field(
+    exposure: Literal["fixed", "learned"] = Field(
         default="fixed",
-        description="Whether exposure and white balance of each photograph are learned; `auto` as for `cameras`.",
+        description="Whether exposure and white balance of each photograph are learned.",
     )
     checkpoint_seconds: float = Field(default=20.0, ge=0, le=1e6, description="Seconds from one checkpoint to the next.")
     stages: tuple[Stage, ...] | None = Field(

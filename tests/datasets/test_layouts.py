@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from rgs_mi.commands.optimize import optimize
+from rgs_mi.datasets import load_dataset
+from rgs_mi.fit.scene import FitScene
 
 from captures import (
     FOCAL,
@@ -76,3 +78,15 @@ def test_fit(inputs, tmp_path, monkeypatch, layout):
         assert np.linalg.norm(centers, axis=1).max() > 20
     assert (folder / "report.html").stat().st_size > 10_000
     assert np.isfinite(np.array(mi.render(scene, sensor=0))).all()
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_photographs_have_settings_of_their_own(inputs, tmp_path, layout):
+    (tmp_path / layout).mkdir()
+    data, photographed = LAYOUTS[layout](tmp_path / layout), layout in ("nerfstudio", "colmap", "llff")
+    scene = FitScene.load(inputs[0], data)
+    assert load_dataset(data).photographed == photographed
+    settings = scene.settings()
+    assert (settings.cameras == settings.exposure == "learned") == photographed
+    assert scene.settings(overrides=["cameras=fixed"]).cameras == "fixed"
+    assert scene.settings("sh2dgs").learning_rates.delta_normal == (0, 0)

@@ -1,0 +1,82 @@
+"""What a fit does of itself where settings leave it open."""
+
+from dataclasses import replace
+
+import pytest
+
+from rgs_mi.fit.plan import agree, planned, told
+from rgs_mi.fit.trainer import LEAST_STEPS, STEPS, Fit
+from rgs_mi.settings.config import to_dict
+from rgs_mi.settings.settings import Density, Initialization, Settings, Stage
+
+from fits import SETTINGS, model, random_photographs
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return random_photographs()
+
+
+def with_pixels(dataset, count):
+    """``dataset`` with cameras that see so many times as many pixels a side, all of the object, and no pictures."""
+    views = []
+    for view in dataset.train:
+        width, height = view.camera.size
+        views.append(replace(view, camera=view.camera.resized(width * count, height * count), masked=False))
+    return replace(dataset, train=views)
+
+
+@pytest.mark.parametrize(
+    "minutes, scale, most",
+    [(10, 1, 50_000), (10, 4, 83 * 75 * 16), (5, 4, 75_000), (20, 1, 100_000), (None, 4, 50_000)],
+)
+def test_surfels_go_with_pixels_and_minutes(dataset, minutes, scale, most):
+    settings = Settings(minutes=minutes, iterations=None if minutes else 100)
+    found = planned(settings, with_pixels(dataset, scale))
+    assert found.density.max_surfels == most and found.initialization.surfels == max(25_000, most // 2)
+
+
+def test_levels_begin_at_some_200_pixels(dataset):
+    stages = planned(Settings(), with_pixels(dataset, 10)).stages  # 830 pixels
+    assert [(s.until, s.downscale) for s in stages] == [(0.1, 4), (0.2, 2), (1.0, 1)]
+
+
+def test_what_is_asked_for_stays(dataset):
+    asked = replace(SETTINGS, density=Density(max_surfels=7), initialization=Initialization(surfels=5))
+    assert planned(asked, dataset) == asked
+
+
+def test_jobs_know_their_fits(dataset):
+    asked = Settings(minutes=3)
+    saved = to_dict(planned(asked, dataset))
+    assert agree(to_dict(asked), saved)
+    assert not agree(to_dict(replace(asked, seed=1)), saved)
+    assert not agree(to_dict(replace(asked, density=Density(max_surfels=9))), saved)
+    assert not agree(to_dict(asked), {"minutes": 3})
+
+
+def test_what_is_decided_is_told(dataset):
+    line = told(planned(Settings(), dataset), dataset)
+    assert "6 images of known cameras of 83 x 75 pixels, with masks, and 0 held out" in line
+    assert "cameras=fixed, exposure=fixed, density.max_surfels=50000" in line
+    some = [replace(dataset.train[0], masked=False), *dataset.train[1:]]
+    assert "6 photographs" in told(planned(Settings(), dataset), replace(dataset, train=some, photographed=True))
+    assert "5 of them with masks" in told(planned(Settings(), dataset), replace(dataset, train=some))
+
+
+def test_levels_wait_for_steps_and_time(dataset):
+    """However fast or slow steps are: none is left early, and none begun that there is no time for."""
+    stages = (Stage(0.1, 4, 1), Stage(0.2, 2, 1), Stage(1.0, 1, 1))
+    fit = Fit(dataset, model(), replace(SETTINGS, iterations=None, minutes=1.0, stages=stages), 1.0)
+    fit.step()
+    assert fit.stage.downscale == 4
+    fit.elapsed = 13.0  # past both by the clock
+    assert fit.stage.downscale == 4, "too few steps"
+    level = fit._level
+    level.steps = STEPS[0]
+    level.seconds.clear()
+    level.seconds.append(47.0 / LEAST_STEPS[0] / 4.1)  # the next takes four times as long
+    assert fit.stage.downscale == 2
+    level.seconds.clear()
+    level.seconds.append(47.0 / LEAST_STEPS[0] / 3.9)
+    assert fit.stage.downscale == 4, "no time for it"
