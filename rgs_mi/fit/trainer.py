@@ -22,7 +22,7 @@ from .curves import Curves
 from .density import DensityControl
 from .model import ENVIRONMENT, Model
 from .objective import Objective
-from .plan import LEAST_STEPS, STEPS
+from .plan import LAST, LEAST_STEPS, STEPS
 from .schedule import Schedule
 
 _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
@@ -120,14 +120,15 @@ class Fit:
     @property
     def stage(self) -> Stage:
         """The level of the pyramid in use: that of the schedule; in a fit that minutes bound, level by level, each after
-        `STEPS` of the one before, and if there is time for `LEAST_STEPS`."""
+        `STEPS` of the one before, and if there is time for `LEAST_STEPS`, or in its last part (`LAST`) for every view once."""
         planned, now, s = self.schedule.stage(self.progress), self._level, self.settings
         if now is None or s.iterations or s.minutes is None or planned.downscale >= now.stage.downscale:
             return planned
         finer = max((stage for stage in s.stages or () if stage.downscale < now.stage.downscale), key=lambda x: x.downscale)
         pixels = (now.stage.downscale / finer.downscale) ** 2 * finer.views / now.stage.views
         last = finer.downscale == 1  # it costs most, and shows least
-        affordable = 60 * s.minutes - self.elapsed > LEAST_STEPS[last] * pixels * np.median(now.seconds)
+        least = len(self.dataset.train) if self.progress > 1 - LAST else LEAST_STEPS[last]
+        affordable = 60 * s.minutes - self.elapsed > least * pixels * np.median(now.seconds)
         return finer if affordable and now.steps >= STEPS[last] else now.stage
 
     @property

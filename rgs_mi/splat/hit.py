@@ -1,6 +1,6 @@
 """A pixel meets a surfel: the weight and depth of its hit, their derivatives, and what surfels are sorted by."""
 
-import math
+import itertools
 from collections.abc import Sequence
 
 import drjit as dr
@@ -13,7 +13,7 @@ PACKET = 4  # floats per gather and scatter
 HORIZON = 1e-5  # least h of (1): beyond it a ray runs along the surfel's plane, or meets it behind the camera
 _LEAST_ROWS = 1024
 _MOST_COPIED = 2**26  # floats, in all threads together
-_HALF_DIAGONAL = 0.5 * math.hypot(BLOCK[0] - 1, BLOCK[1] - 1)  # from a block's middle to its pixels' centers
+_SLACK = 1e-3  # of squared distances from surfels, for rounding
 
 
 def padded(count: int) -> int:
@@ -77,17 +77,16 @@ class Hit:
 
     def sort_key(self, gaussian: "Sequence[mi.Float]", cutoffs: Cutoffs) -> "mi.Float":
         """Return the depth t, if this hit is in the middle of a block's pixels, and −∞ where none of them can see the
-        surfel."""
+        surfel: where α is at the cut-off or below at each, with u and v taken times h to spare the divisions."""
         _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, opacity = gaussian[: len(GEOMETRY)]
-        tilt = _HALF_DIAGONAL * dr.sqrt(N_x * N_x + N_y * N_y)
-        turn = _HALF_DIAGONAL * dr.sqrt(A_x * A_x + A_y * A_y + B_x * B_x + B_y * B_y)
-        # From the middle to a pixel, h changes by at most tilt, and (u, v) by (turn + |(u, v)| tilt) / h there
-        distance = dr.sqrt(self.u * self.u + self.v * self.v)
-        least_h = dr.rcp(self.inv_h) - tilt
-        on_plane = dr.select(least_h > HORIZON, distance - (turn + distance * tilt) / least_h, 0)
-        on_screen = math.sqrt(LOW_PASS) * (dr.sqrt(self.dx * self.dx + self.dy * self.dy) - _HALF_DIAGONAL)
-        nearest = dr.maximum(dr.minimum(on_plane, on_screen), 0)
-        return dr.select(opacity * dr.exp(-0.5 * nearest * nearest) > cutoffs.alpha_min, self.t, -dr.inf)
+        limit = 2 * dr.log(opacity / cutoffs.alpha_min) + _SLACK
+        seen = mi.Bool(False)
+        for x, y in itertools.product(*((k - 0.5 * (n - 1) for k in range(n)) for n in BLOCK)):
+            dx, dy = self.dx + x, self.dy + y
+            h, u, v = (offset + a * dx + b * dy for offset, a, b in ((1, N_x, N_y), (0, A_x, A_y), (0, B_x, B_y)))
+            seen |= (h > HORIZON) & (u * u + v * v < limit * h * h)
+            seen |= LOW_PASS * (dx * dx + dy * dy) < limit
+        return dr.select(seen, self.t, -dr.inf)
 
     def vjp(
         self, gaussian: "Sequence[mi.Float]", d_alpha: "mi.Float", d_t: "mi.Float", d_offset: "Sequence[mi.Float]"
