@@ -123,19 +123,24 @@ def isect_tiles(projected: Projected, size: tuple[int, int], cutoffs: Cutoffs) -
         ids = dr.empty(mi.UInt32, dr.width(tiles.ids) * blocks)
         dr.eval(gaussians, first, end, stop, start, x, y)
 
-        def step(i, at, depths, surfels):
-            listed = i < end
-            surfel = dr.gather(mi.UInt32, tiles.ids, i, listed)
-            gaussian = fetch(gaussians, surfel, padded(len(projected.geometry)), listed)
-            # One surfel enters the queue, the nearest leaves it; "farther than all" drives the rest out in the end.
-            depth = dr.select(listed, Hit(gaussian, x, y, cutoffs).sort_key(gaussian, cutoffs), dr.inf)
+        def queued(depth, surfel, at, depths, surfels):
             for k in reversed(range(cutoffs.resort_window)):
                 nearer = depth < depths[k]
                 depth, depths[k] = dr.minimum(depth, depths[k]), dr.maximum(depth, depths[k])
                 surfel, surfels[k] = dr.select(nearer, surfel, surfels[k]), dr.select(nearer, surfels[k], surfel)
             leaves = depth > -dr.inf
             dr.scatter(ids, surfel, at, leaves)
-            return i + 1, at + dr.select(leaves, mi.UInt32(1), 0), depths, surfels
+            return depth, surfel, at + dr.select(leaves, mi.UInt32(1), 0), depths, surfels
+
+        def step(i, at, depths, surfels):
+            listed = i < end
+            surfel = dr.gather(mi.UInt32, tiles.ids, i, listed)
+            gaussian = fetch(gaussians, surfel, padded(len(projected.geometry)), listed)
+            # One surfel enters the queue, the nearest leaves it; "farther than all" drives the rest out in the end.
+            depth = dr.select(listed, Hit(gaussian, x, y, cutoffs).sort_key(gaussian, cutoffs), dr.inf)
+            state = depth, surfel, at, depths, surfels
+            _, _, at, depths, surfels = dr.if_stmt(state, depth > -dr.inf, queued, lambda *state: state)
+            return i + 1, at, depths, surfels
 
         empty = [mi.Float(-dr.inf)] * cutoffs.resort_window, [mi.UInt32(0)] * cutoffs.resort_window
         past = dr.while_loop((first, start, *empty), lambda i, at, depths, surfels: i < stop, step, label="sort")[1]
