@@ -1,7 +1,6 @@
 """Photographs and their cameras: a folder in, lists of `View` out."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 from ..core.errors import UserError
@@ -26,7 +25,7 @@ def load_dataset(root: str | Path, longest: int = LONGEST, quiet: bool = True) -
     layout = _layout(root)
     if layout is None:
         raise UserError(f"data folder '{root}' has no layout that is known: looked for {looked_for()}")
-    dataset = replace(layout.load(root, longest), photographed=layout.PHOTOGRAPHED)
+    dataset = layout.load(root, longest)
     if not quiet:
         _tell_scaled(dataset, longest)
     return dataset

@@ -43,7 +43,7 @@ def load(root: Path, longest: int = LONGEST) -> Dataset:
     splits = {"train": load_views(root / TRAIN, _frames(root / TRAIN, ()), longest), "test": []}
     if (root / TEST).is_file():
         splits["test"] = load_views(root / TEST, _frames(root / TEST, ("_normal.png", "_normal_0001.png")), longest)
-    return Dataset(**splits, points=points, point_colors=colors, root=root)
+    return Dataset(**splits, points=points, point_colors=colors, root=root, photographed=PHOTOGRAPHED)
 
 
 def _frames(file: Path, normals: tuple[str, ...]) -> list[Frame]:

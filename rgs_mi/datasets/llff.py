@@ -59,6 +59,7 @@ def load(root: Path, longest: int = LONGEST) -> Dataset:
         points=points,
         point_colors=colors,
         root=root,
+        photographed=PHOTOGRAPHED,
     )
 
 
