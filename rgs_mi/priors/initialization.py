@@ -8,8 +8,9 @@ from ..core.camera import focus_point
 from ..core.color import srgb_decode
 from ..datasets.types import Dataset
 from . import hull, stereo
+from .openings import COPIES, openings, seen_through
 from .sampling import sample_surface
-from .surface_points import oriented_points, seen_through
+from .surface_points import oriented_points
 
 _FAR = 10
 _DEEPER = 2  # area of what lies below the hull, over that of the hull that is seen through
@@ -65,8 +66,11 @@ def _on_hull(views, count, rng, compare, outvoted, quiet) -> Points:
     positions, normals = sample_surface(*mesh, count, rng)
     if compare:
         maps = stereo.verified(stereo.depth_maps(views, mesh[:2], quiet))
-        gone, tree = seen_through(positions, maps), spatial.KDTree(positions)
-        below = oriented_points(maps, _DEEPER * int(gone.sum()), rng, lambda above: gone[tree.query(above, workers=-1)[1]])
+        opened = openings(stereo.depth_maps(views, mesh[:2], quiet, COPIES))
+        gone, tree = seen_through(positions, opened, maps), spatial.KDTree(positions)
+        below = oriented_points(
+            opened + maps, _DEEPER * int(gone.sum()), rng, lambda above: gone[tree.query(above, workers=-1)[1]]
+        )
         if not gone.all():
             positions, normals = (np.concatenate([on[~gone], new]) for on, new in zip((positions, normals), below))
     spacing = _spacing(positions)

@@ -26,7 +26,7 @@ from ..core.progress import Progress
 from ..datasets.types import View
 from . import hull
 
-_PIXELS = 400**2  # of a photograph's copy, about
+PIXELS = 400**2  # of a photograph's copy, about
 _LEVELS, _ABOVE = 44, 4  # depths below the hull; those of them that lie above it
 _REACH = 0.75  # the deepest, over the hull's radius
 _INVERSE_LEVELS = 128  # depths where there is no hull
@@ -35,9 +35,9 @@ _NEIGHBOURS, _BEST = 6, 3  # views that each is compared with, and those of them
 _BASELINE, _WIDEST = 10.0, 35.0  # degrees between the directions to two neighbours: wished, and at most
 _WINDOW = 2  # pixels on each side
 _FLAT = 1e-4  # variance of grey levels in a window that shows nothing
-_SAME = 1.5  # levels between two depths that are the same
-_WITNESSES = 16  # views that are asked whether they agree
-_VIEWS, _AGREED = 2, 0.5  # of them, at least, and their part of those that look there
+SAME = 1.5  # levels between two depths that are the same
+WITNESSES = 16  # views that are asked whether they agree
+VIEWS, _AGREED = 2, 0.5  # of them, at least, and their part of those that look there
 
 
 @dataclass(frozen=True)
@@ -48,12 +48,12 @@ class SmallImage:
     grey: np.ndarray
 
     @classmethod
-    def of(cls, view: View) -> "SmallImage":
-        """Return the copy of a view's photograph, of `_PIXELS` pixels at most, or nearly so."""
+    def of(cls, view: View, pixels: int = PIXELS) -> "SmallImage":
+        """Return the copy of a view's photograph, of ``pixels`` pixels at most, or nearly so."""
         width, height = view.camera.size
-        factor = max(1, int(np.ceil(np.sqrt(width * height / _PIXELS) - 0.1)))
-        pixels = view.pixels / np.float32(255) if view.pixels.dtype == np.uint8 else view.pixels
-        grey = np.clip(pixels[..., :3], 0, 1).mean(-1) * pixels[..., 3] + 1 - pixels[..., 3]
+        factor = max(1, int(np.ceil(np.sqrt(width * height / pixels) - 0.1)))
+        rgba = view.pixels / np.float32(255) if view.pixels.dtype == np.uint8 else view.pixels
+        grey = np.clip(rgba[..., :3], 0, 1).mean(-1) * rgba[..., 3] + 1 - rgba[..., 3]
         w, h = width // factor, height // factor
         grey = downscale_local_mean(grey[: h * factor, : w * factor], (factor, factor))
         camera = view.camera.cropped(0, 0, w * factor, h * factor).resized(w, h)
@@ -75,6 +75,7 @@ class DepthMap:
     likeness   [H, W] how alike the views are there: the mean of the best correlations, in [−1, 1]
     tolerance  [H, W] how far apart two depths may be, there, that are the same, in world units
     hull       [H, W] z-depth of the visual hull, NaN beside it; None without masks
+    gain       [H, W] how much more alike they are than on the hull; None without masks
     """
 
     camera: Camera
@@ -82,13 +83,14 @@ class DepthMap:
     likeness: np.ndarray
     tolerance: np.ndarray
     hull: np.ndarray | None = None
+    gain: np.ndarray | None = None
 
 
-def depth_maps(views: Sequence[View], mesh: tuple | None = None, quiet: bool = True) -> list[DepthMap]:
-    """Sweep all ``views``; ``mesh`` are the vertices and faces of their `hull.surface`, None where they have no masks. ``quiet``
-    shows no progress. A JIT variant must be active."""
+def depth_maps(views: Sequence[View], mesh: tuple | None = None, quiet: bool = True, pixels: int = PIXELS) -> list[DepthMap]:
+    """Sweep all ``views`` in copies of ``pixels``; ``mesh`` are the vertices and faces of their `hull.surface`, None where they
+    have no masks. ``quiet`` shows no progress. A JIT variant must be active."""
     with Progress(quiet=quiet, label="comparing the photographs") as progress:
-        small = [SmallImage.of(view) for view in views]
+        small = [SmallImage.of(view, pixels) for view in views]
         cameras, images = [s.camera for s in small], [s.normalized for s in small]
         surfaces = [None] * len(small) if mesh is None else hull.depth_maps(mesh[0], mesh[1], cameras)
         levels, step = _levels(cameras, mesh)
@@ -127,10 +129,11 @@ def _depth_map(i, cameras, images, surfaces, levels, step, others):
     """The `DepthMap` of view ``i``."""
     (width, height), surface = cameras[i].size, surfaces[i]
     known = np.ones((height, width), bool) if surface is None else np.isfinite(surface)
-    depth, likeness = np.full((height, width), np.nan, np.float32), np.zeros((height, width), np.float32)
-    tolerance = np.full((height, width), _SAME * step, np.float32)
+    depth = np.full((height, width), np.nan, np.float32)
+    likeness, gain = np.zeros((2, height, width), np.float32)
+    tolerance = np.full((height, width), SAME * step, np.float32)
     if len(others) < 2 or not known.any():
-        return DepthMap(cameras[i], depth, likeness, tolerance, surface)
+        return DepthMap(cameras[i], depth, likeness, tolerance, surface, gain)
     (window,) = ndimage.find_objects(known.astype(np.int8))
     rows, columns = window
     camera = cameras[i].cropped(columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start)
@@ -141,14 +144,16 @@ def _depth_map(i, cameras, images, surfaces, levels, step, others):
         images[i][window],
         [at(level) for level in levels],
         [(cameras[j], images[j], surfaces[j]) for j in others],
-        (_SAME + 0.5) * step,
+        (SAME + 0.5) * step,
     )
     best, offset, likeness[window] = _peak(score)
     found = at(np.interp(best + offset, np.arange(len(levels)), levels))
     depth[window] = np.where(known[window], found, np.nan)
     if surface is None:
-        tolerance[window] = _SAME * step * found**2
-    return DepthMap(cameras[i], depth, np.where(known, likeness, 0), tolerance, surface)
+        tolerance[window] = SAME * step * found**2
+        return DepthMap(cameras[i], depth, likeness, tolerance)
+    gain[window] = likeness[window] - score[: _ABOVE + 2].max(0)
+    return DepthMap(cameras[i], depth, np.where(known, likeness, 0), tolerance, surface, gain)
 
 
 def _peak(score):
@@ -255,24 +260,26 @@ def verified(maps: Sequence[DepthMap]) -> list[DepthMap]:
         depth = as_float(np.nan_to_num(m.depth))
         points = opaque(m.camera).origin + pixel_rays(m.camera, index) * depth
         dr.eval(points)
-        count, same, through = _agreement(points, [maps[j] for j in neighbours(i, cameras, center, _WITNESSES)])
-        alike = (count >= _VIEWS) & (same > _AGREED * (same + through)) & (depth > 0)
+        count, same, through = _agreement(points, [maps[j] for j in neighbours(i, cameras, center, WITNESSES)])
+        alike = (count >= VIEWS) & (same > _AGREED * (same + through)) & (depth > 0)
         alike = alike.numpy().reshape(m.depth.shape).astype(np.float32)
         alike *= ndimage.uniform_filter(alike, 2 * _WINDOW + 1) > _AGREED
         kept.append(replace(m, likeness=m.likeness * alike))
     return kept
 
 
-def agreement(points: np.ndarray, maps: Sequence[DepthMap]) -> tuple[np.ndarray, np.ndarray]:
-    """Return how many of ``maps`` have a surface at each of ``points`` [N, 3], and how many look through it at something farther,
-    [N] each; a view counts by its likeness there."""
+def agreement(points: np.ndarray, maps: Sequence[DepthMap]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return how many of ``maps`` have a surface at each of ``points`` [N, 3], and the sums of the likeness of these, and of those
+    that look through it at something farther, [N] each."""
+    if not len(points):
+        return np.zeros(0), np.zeros(0), np.zeros(0)
     p = mi.Point3f(*(as_float(np.ascontiguousarray(x)) for x in np.asarray(points, np.float32).T))
-    _, same, through = _agreement(p, maps)
-    return same.numpy(), through.numpy()
+    dr.eval(p)
+    return tuple(v.numpy() for v in _agreement(p, maps))
 
 
 def _agreement(points, maps):
-    """`agreement` of Dr.Jit's ``points``, after the number of ``maps`` that have a surface there."""
+    """`agreement` of Dr.Jit's ``points``."""
     count, same, through = (dr.zeros(mi.Float, dr.width(points)) for _ in range(3))
     for m in maps:
         seen = opaque(m.camera)

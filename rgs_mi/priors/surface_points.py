@@ -6,10 +6,9 @@ import numpy as np
 from scipy import ndimage, spatial
 
 from .sampling import thinned
-from .stereo import DepthMap, agreement
+from .stereo import DepthMap
 
 _ALIKE = 0.3  # likeness that is worth a candidate
-_SEEN_THROUGH = 0.6, 2.0  # part, and number, of views that look through what is not there
 _CANDIDATES, _MOST = 3, 1_000_000  # for each point that is wanted; in all
 _NEIGHBOURS, _TURN = 16, 0.5  # points that each is smoothed with, and the least cosine of their normals
 _BLUR = 1.5  # pixels of a depth map, for normals
@@ -36,13 +35,6 @@ def oriented_points(
     distance, _ = spatial.KDTree(positions).query(positions, 4, workers=-1)
     kept = thinned(positions, _DISK * distance[:, 1:].mean(1))
     return positions[kept], normals[kept]
-
-
-def seen_through(points: np.ndarray, maps: Sequence[DepthMap]) -> np.ndarray:
-    """Return [N] which of ``points`` [N, 3] most of the ``maps`` look through."""
-    same, through = agreement(points, maps)
-    part, views = _SEEN_THROUGH
-    return (through > views) & (through > part * (same + through))
 
 
 def smoothed(positions: np.ndarray, normals: np.ndarray) -> Oriented:

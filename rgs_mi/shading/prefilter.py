@@ -8,7 +8,8 @@ small real matrix per longitudinal frequency m:
 
 with K the principled BSDF's lobe (`tables.lobe`), γ the angle between the directions, and hats because Mitsuba's
 `envmap` interpolates bilinearly. Rows are normalized: a constant environment stays constant. The poles are
-exact, and the adjoint is the transpose of (5).
+exact, and the adjoint is the transpose of (5). The southern hemisphere mirrors the northern, so in sums and differences of
+rows that mirror each other M_m falls apart once more, into two of a quarter of its size.
 """
 
 import functools
@@ -70,14 +71,37 @@ def _fold(count, columns, frequencies):
     return ((alias[:, None] == np.arange(frequencies)) * np.where(twice, 2 * hat, hat)[:, None]).astype(np.float32)
 
 
+def _mirrored(x, axis=1):
+    """Sums and differences of the rows of ``x``, along ``axis``, that mirror each other at the equator, over √2; the row in the
+    middle of an odd number of them is a sum. Orthogonal: `_unmirrored` is its inverse and its adjoint."""
+    x = np.moveaxis(x, axis, 0)
+    half = len(x) // 2
+    north, south, root = x[:half], x[::-1][:half], np.float32(0.5**0.5)
+    parts = np.concatenate([(north + south) * root, x[half : len(x) - half]]), (north - south) * root
+    return tuple(np.moveaxis(part, 0, axis) for part in parts)
+
+
+def _unmirrored(sums, differences):
+    """[M, rows, C] that have these `_mirrored` parts."""
+    half, root = differences.shape[1], np.float32(0.5**0.5)
+    north, south = (sums[:, :half] + differences) * root, (sums[:, :half] - differences) * root
+    return np.concatenate([north, sums[:, half:], south[:, ::-1]], axis=1)
+
+
+def _floats(x):
+    """[M, rows, 2 C] real and imaginary parts of ``x`` [M, rows, C]."""
+    return np.ascontiguousarray(x, np.complex64).view(np.float32)
+
+
 @dataclass(frozen=True)
 class Prefilter:
     """The operator (5) for environments of ``size`` (rows, columns). ``maps`` are the (rows, columns) of each level's map,
-    ``matrices`` the M_m of each level but the first, [frequencies, rows of the map, rows]."""
+    ``matrices`` the M_m of each level but the first, between the sums, and between the differences, of `_mirrored` rows: pairs
+    of [frequencies, rows of the map / 2, rows / 2]."""
 
     size: tuple[int, int]
     maps: tuple[tuple[int, int], ...]
-    matrices: tuple[np.ndarray, ...]
+    matrices: tuple[tuple[np.ndarray, np.ndarray], ...]
 
     @property
     def offsets(self) -> np.ndarray:
@@ -92,11 +116,13 @@ class Prefilter:
     def apply(self, texels: np.ndarray) -> np.ndarray:
         """Filter ``texels`` [rows, columns, 3] float32: return the maps of all levels, [texels, 3]."""
         rows, columns = self.size
-        spectrum = np.asarray(fft.rfft(texels.transpose(1, 0, 2), axis=0))  # [M, rows, 3]
+        parts = [
+            _floats(part) for part in _mirrored(np.asarray(fft.rfft(texels.transpose(1, 0, 2), axis=0)))
+        ]  # [M, rows / 2, 6]
         out = [texels.reshape(-1, 3)]
-        for (_, c), matrix in zip(self.maps[1:], self.matrices):
-            m = matrix.shape[0]
-            product = matrix @ spectrum[:m].view(np.float32)
+        for (_, c), pair in zip(self.maps[1:], self.matrices):
+            m = pair[0].shape[0]
+            product = _unmirrored(*(matrix @ part[:m] for matrix, part in zip(pair, parts)))
             level = product.view(np.complex64) * self._phase(m, c)[:, None, None] * np.float32(c / columns)
             out.append(np.asarray(fft.irfft(level, n=c, axis=0)).transpose(1, 0, 2).reshape(-1, 3))
         return np.concatenate(out)
@@ -106,14 +132,16 @@ class Prefilter:
         `apply`."""
         rows, columns = self.size
         first = rows * columns
-        spectrum = np.zeros((columns // 2 + 1, rows, 3), np.complex64)
-        for (r, c), matrix, offset in zip(self.maps[1:], self.matrices, self.offsets[1:]):
-            m = matrix.shape[0]
+        parts = [np.zeros((columns // 2 + 1, n, 6), np.float32) for n in (rows - rows // 2, rows // 2)]
+        for (r, c), pair, offset in zip(self.maps[1:], self.matrices, self.offsets[1:]):
+            m = pair[0].shape[0]
             level = adjoint[offset : offset + r * c].reshape(r, c, 3).transpose(1, 0, 2)
             level = np.asarray(fft.rfft(level, axis=0))[:m] * self._phase(m, c).conj()[:, None, None]
             if c % 2 == 0 and m == c // 2 + 1 and c < columns:
                 level[-1] *= 0.5  # irfft reads the highest frequency of a short map once, of a long one twice
-            spectrum[:m] += (matrix.transpose(0, 2, 1) @ np.ascontiguousarray(level).view(np.float32)).view(np.complex64)
+            for total, matrix, part in zip(parts, pair, _mirrored(level)):
+                total[:m] += matrix.transpose(0, 2, 1) @ _floats(part)
+        spectrum = _unmirrored(*parts).view(np.complex64)
         grad = np.asarray(fft.irfft(spectrum, n=columns, axis=0)).transpose(1, 0, 2)
         return grad + adjoint[:first].reshape(rows, columns, 3)
 
@@ -133,7 +161,11 @@ def prefilter(rows: int, columns: int, variant: str) -> Prefilter:
         out_rows = min(level_rows or rows, rows)
         out_columns = columns if out_rows == rows else 2 * out_rows
         maps.append((out_rows, out_columns))
-        matrices.append(_kernel_matrix(kernel_at, width, rows, columns, out_rows))
+        halves = (
+            _mirrored(half, axis=2)[k]
+            for k, half in enumerate(_mirrored(_kernel_matrix(kernel_at, width, rows, columns, out_rows)))
+        )
+        matrices.append(tuple(np.ascontiguousarray(half) for half in halves))
     return Prefilter((rows, columns), tuple(maps), tuple(matrices))
 
 

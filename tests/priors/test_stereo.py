@@ -11,8 +11,9 @@ from rgs_mi.core.camera import Camera
 from rgs_mi.datasets.types import Dataset, View
 from rgs_mi.priors import hull, stereo
 from rgs_mi.priors.initialization import initial_points
+from rgs_mi.priors.openings import openings, seen_through
 from rgs_mi.priors.sampling import thinned
-from rgs_mi.priors.surface_points import oriented_points, seen_through, smoothed
+from rgs_mi.priors.surface_points import oriented_points, smoothed
 
 SIZE, VIEWS = 128, 48
 RIM, FLOOR, HALF, INNER = 0.25, -0.1, 0.5, 0.42  # of the tray: heights, half widths outside and inside
@@ -187,28 +188,48 @@ def test_agreement_is_what_loops_say():
     rng = np.random.default_rng(3)
     maps = [depth_map(rng, camera) for camera in above(2.2)[:6]]
     points = rng.uniform(-0.6, 0.6, (40, 3)).astype(np.float32)
-    same, through = stereo.agreement(points, maps)
+    count, same, through = stereo.agreement(points, maps)
     for k, point in enumerate(points):
-        expected = np.zeros(2)
+        expected = np.zeros(3)
         for m in maps:
             (pixel,), (z,) = m.camera.project(point[None])
             column, row = np.floor(pixel).astype(int)
             if not (0 <= column < SIZE and 0 <= row < SIZE) or np.isnan(m.depth[row, column]):
                 continue
             farther, weight = m.depth[row, column] - z, m.likeness[row, column]
-            expected += [weight * (abs(farther) <= 0.3), weight * (farther > 0.3)]
-        assert [same[k], through[k]] == pytest.approx(expected, abs=1e-5)
+            meets = abs(farther) <= 0.3
+            expected += [meets, weight * meets, weight * (farther > 0.3)]
+        assert [count[k], same[k], through[k]] == pytest.approx(expected, abs=1e-5)
 
 
-def test_seen_through_asks_for_most_and_for_several():
+def flat_map(camera, depth, likeness=1.0, gain=1.0):
+    """A wall at ``depth`` below a hull at 2."""
+    return stereo.DepthMap(camera, *(np.full((SIZE, SIZE), v, np.float32) for v in (depth, likeness, 0.075, 2.0, gain)))
+
+
+def test_seen_through_asks_for_several_and_heeds_who_sees_a_surface():
+    camera, center = above(2.2)[0], np.zeros((1, 3))
+    far, near = flat_map(camera, 3.0), flat_map(camera, 2.2)
+    assert not seen_through(center, [far] * 2, [])[0]
+    assert seen_through(center, [far] * 3, [])[0]
+    assert not seen_through(center, [far] * 3, [near])[0]
+    assert seen_through(center, [far] * 3, [near, far])[0]
+
+
+def test_openings_are_where_views_agree_on_what_is_more_alike_than_the_hull():
+    """Views of one place find a wall below their hull; not where the hull is as alike, where they differ, or at the hull."""
     camera = above(2.2)[0]
-    far = lambda likeness: stereo.DepthMap(camera, *(np.full((SIZE, SIZE), v, np.float32) for v in (3.0, likeness, 0.1)))
-    near = stereo.DepthMap(camera, *(np.full((SIZE, SIZE), v, np.float32) for v in (2.2, 1.0, 0.1)))
-    center = np.zeros((1, 3))
-    assert not seen_through(center, [far(1.0)] * 2)[0]
-    assert seen_through(center, [far(1.0)] * 3)[0]
-    assert not seen_through(center, [far(0.5)] * 3)[0]
-    assert not seen_through(center, [far(1.0)] * 3 + [near] * 3)[0]
+    cameras = [
+        Camera.look_at(camera.origin + 0.03 * np.eye(3)[k % 3] * (k - 3), (0, 0, 0), (0, 0, 1), 40, (SIZE, SIZE))
+        for k in range(8)
+    ]
+    opened = lambda depths, gain: np.mean(
+        [m.likeness.mean() for m in openings([flat_map(c, d, gain=gain) for c, d in zip(cameras, depths)])]
+    )
+    assert opened([2.5] * 8, 0.2) > 0.5
+    assert opened([2.5] * 8, 0.05) == 0
+    assert opened([2.3 + 0.2 * k for k in range(8)], 0.2) == 0
+    assert opened([2.1] * 8, 0.2) == 0
 
 
 def test_thinned_points_keep_their_distance_and_leave_no_gap():
