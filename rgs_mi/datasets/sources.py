@@ -12,13 +12,13 @@ import numpy as np
 from scipy import ndimage
 
 from ..core.errors import UserError
+from .exif import ORIENTATION, exposure_value, kept
 from .images import check_size, limited
 
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png")
 _OTHERS = {".heic": "HEIC", ".heif": "HEIC", ".dng": "raw", ".cr2": "raw", ".nef": "raw", ".arw": "raw", ".tif": "TIFF"}
 _QUALITY = 95  # of JPEG
 _SHARPNESS_SIDE = 800  # pixels: blur of phones is seen, noise of sensors is not
-_ORIENTATION, _EXIF, _FOCAL_35MM, _EXPOSURE, _APERTURE, _ISO = 0x0112, 0x8769, 0xA405, 0x829A, 0x829D, 0x8827
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ def photographs(folder: Path, target: Path, longest: int, done: Callable[[float]
     """Copy the photographs in ``folder`` (not in folders below it) to ``target`` by name; those of more than ``longest`` pixels
     along a side are scaled, those that EXIF says lie on their side are turned. ``done`` is told the fraction that is done.
 
-    The focal length stays in the EXIF of what is encoded again; places and times do not.
+    Focal length and exposure stay in the EXIF of what is encoded again; places and times do not.
     Raises: UserError for a folder without photographs, for two of one name, and for files that can't be read.
     """
     shown = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
@@ -79,7 +79,7 @@ def _photograph(path: Path, target: Path, stem: str, longest: int) -> Source:
         with Image.open(path, formats=("PNG", "JPEG", "MPO")) as image:
             check_size(*image.size)
             exif = image.getexif()
-            turned = exif.get(_ORIENTATION, 1) not in (0, 1)
+            turned = exif.get(ORIENTATION, 1) not in (0, 1)
             size = limited(image.size, longest)
             verbatim = not turned and size == image.size and image.format != "MPO"
             image.draft(image.mode, size)
@@ -102,9 +102,9 @@ def _photograph(path: Path, target: Path, stem: str, longest: int) -> Source:
     elif name.endswith(".png"):
         pixels.save(target / name)
     else:
-        pixels.save(target / name, quality=_QUALITY, subsampling=0, exif=_focal_alone(exif))
+        pixels.save(target / name, quality=_QUALITY, subsampling=0, exif=kept(exif))
     masked = alpha and np.asarray(pixels)[..., 3].min() < 255
-    return Source(name, path.name, sharpness(np.asarray(pixels.convert("L"))), _exposure(exif), bool(masked))
+    return Source(name, path.name, sharpness(np.asarray(pixels.convert("L"))), exposure_value(exif), bool(masked))
 
 
 def sharpness(grey: np.ndarray) -> float:
@@ -114,27 +114,6 @@ def sharpness(grey: np.ndarray) -> float:
     size = limited(grey.shape[::-1], _SHARPNESS_SIDE)
     small = Image.fromarray(np.ascontiguousarray(grey, np.uint8)).resize(size, Image.Resampling.BOX)
     return float(ndimage.laplace(np.asarray(small, np.float32)).var())
-
-
-def _focal_alone(exif) -> bytes:
-    """EXIF that holds the focal length, in millimetres of a 35 mm film, and nothing else."""
-    from PIL import Image
-
-    focal, kept = exif.get_ifd(_EXIF).get(_FOCAL_35MM), Image.Exif()
-    if isinstance(focal, int) and focal > 0:
-        kept.get_ifd(_EXIF)[_FOCAL_35MM] = focal
-    return kept.tobytes()
-
-
-def _exposure(exif) -> float | None:
-    tags = exif.get_ifd(_EXIF)
-    iso = tags.get(_ISO)
-    try:
-        seconds, aperture = float(tags[_EXPOSURE]), float(tags.get(_APERTURE, 1.0))
-        value = np.log2(aperture**2 / seconds * 100 / float(iso[0] if isinstance(iso, tuple) else iso or 100))
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):
-        return None
-    return float(value) if np.isfinite(value) else None
 
 
 # ---- Videos ----

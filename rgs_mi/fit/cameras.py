@@ -9,6 +9,7 @@ import numpy as np
 
 from ..core.camera import Camera, focus_point
 from ..core.learned_camera import INTRINSICS, POSE, learned_camera
+from ..datasets.exif import log_gains
 from ..datasets.types import Dataset
 from ..settings.settings import Settings, Weights
 
@@ -63,7 +64,7 @@ class Seen:
 
 
 class Cameras:
-    """Corrections of the cameras of ``views``, and their exposures, zero at first.
+    """Corrections of the cameras of ``views``, and their exposures, zero at first, but for exposures that EXIF tells.
 
     ``rows``: `POSES` [V, 6] and `LENSES` [C, 8], the numbers of `learned_camera`, where cameras are learned, and `EXPOSURE`
     [V, 3], natural logarithms of gains, where exposures are. Views whose intrinsics are the same share a camera. ``pivot``
@@ -93,7 +94,10 @@ class Cameras:
         cameras, exposure = settings.cameras == "learned", settings.exposure == "learned"
         if not (cameras or exposure):
             return None
-        return cls([view.camera for view in dataset.train], extent, cameras, exposure)
+        fitted = cls([view.camera for view in dataset.train], extent, cameras, exposure)
+        if exposure:
+            fitted.rows[EXPOSURE].value += log_gains([view.path for view in dataset.train])[:, None]
+        return fitted
 
     # ---- A step ----
 

@@ -232,6 +232,13 @@ def test_who_learns(dataset):
     assert rows(cameras="learned", exposure="learned") == {POSES, LENSES, EXPOSURE}
 
 
+def test_exposures_start_where_exif_says(dataset, monkeypatch):
+    told = np.linspace(-0.5, 0.5, len(dataset.train))
+    monkeypatch.setattr("rgs_mi.fit.cameras.log_gains", lambda paths: told if len(paths) == len(told) else None)
+    cameras = Cameras.of(dataset, replace(SETTINGS, exposure="learned"), 1.0)
+    assert cameras.gain(0) == pytest.approx(np.exp(-0.5)) and cameras.gain(len(told) - 1) == pytest.approx(np.exp(0.5))
+
+
 def test_views_of_one_camera_share_its_intrinsics(dataset):
     cameras = [v.camera for v in dataset.train]
     cameras[2:4] = [replace(c, focal=(c.focal[0] * 1.1, c.focal[1])) for c in cameras[2:4]]
