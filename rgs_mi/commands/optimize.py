@@ -110,7 +110,10 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
     points = initial_points(dataset, begin.surfels, settings.seed, begin.hull, begin.compare, quiet)
     random = points[1] is None and not (dataset.points is not None and len(dataset.points))
     opacity = begin.opacity or (_ANYWHERE if random else _ON_SURFACE)
-    shading = _shading(scene, dataset, settings)
+    if settings.box is None and not any(view.masked for view in dataset.train):
+        box = BoundingBox.seen_by([view.camera for view in dataset.train], None if random else points[0])
+        settings = replace(settings, box=(*box.min, *box.max))
+    shading = _shading(scene, settings)
     if shading.box is None:
         extent = float(np.linalg.norm(points[0] - points[0].mean(0), axis=1).max())
     else:
@@ -146,18 +149,15 @@ def _with_surroundings(points, dataset, settings):
     return tuple(np.concatenate(pair) for pair in zip(near, far))
 
 
-def _shading(scene, dataset, settings):
-    """How the scene is shaded: in the box around the object where photographs have no masks.
+def _shading(scene, settings):
+    """How the scene is shaded: in the box around the object where there is one.
 
     Raises: UserError for a box that is none.
     """
     try:
-        box = None if settings.box is None else BoundingBox.of(settings.box)
+        return replace(scene.shading, box=None if settings.box is None else BoundingBox.of(settings.box))
     except ValueError as error:
         raise UserError(f"settings: box {settings.box}: {error}") from error
-    if box is None and not any(view.masked for view in dataset.train):
-        box = BoundingBox.seen_by([view.camera for view in dataset.train])
-    return replace(scene.shading, box=box)
 
 
 def _priors(dataset, settings):
@@ -171,6 +171,8 @@ def _resume(saved, scene, dataset, settings) -> Fit:
     """The fit of a checkpoint, under ``settings``; tells which differ from those that it was saved with."""
     arrays, meta = saved
     settings = planned(settings, dataset)
+    if settings.box is None and (box := meta["settings"].get("box")):
+        settings = replace(settings, box=tuple(box))
     if meta["photographs"] != _photographs(dataset):
         raise UserError(f"{dataset.root}: not the photographs of the checkpoint: give its --data, or another --out")
     old, new = _flat(meta["settings"]), _flat(to_dict(settings))
@@ -180,9 +182,7 @@ def _resume(saved, scene, dataset, settings) -> Fit:
     if changed:
         listing = ", ".join(f"{key} {old.get(key)} -> {new[key]}" for key in changed)
         print(f"settings differ from the checkpoint's, the new ones hold: {listing}", file=sys.stderr)
-    return Fit.resume(
-        dataset, settings, arrays, meta, shading=_shading(scene, dataset, settings), priors=_priors(dataset, settings)
-    )
+    return Fit.resume(dataset, settings, arrays, meta, shading=_shading(scene, settings), priors=_priors(dataset, settings))
 
 
 def _photographs(dataset) -> list:

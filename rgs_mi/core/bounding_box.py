@@ -12,7 +12,10 @@ from .camera import Camera, focus_point
 if TYPE_CHECKING:
     import mitsuba as mi
 
-_SIZE = 0.5  # half the box's edges, in distances of the nearest camera from what all look at
+_SIZE = 0.5  # half the box's edges at most, in distances of the nearest camera from what all look at
+_OUTLIERS = 1.0  # percent of the points that may lie outside, on either side
+_MARGIN = 0.1  # room beside the others, over the longest edge
+_FEW = 100  # points: fewer say nothing
 
 
 @dataclass(frozen=True)
@@ -35,11 +38,19 @@ class BoundingBox:
         return cls((x_min, y_min, z_min), (x_max, y_max, z_max))
 
     @classmethod
-    def seen_by(cls, cameras: Sequence[Camera]) -> "BoundingBox":
-        """Return a cube about the `focus_point` of ``cameras``, which leaves them outside."""
+    def seen_by(cls, cameras: Sequence[Camera], points: np.ndarray | None = None) -> "BoundingBox":
+        """Return the box of those of ``points`` [N, 3], on surfaces, that lie in a cube about the `focus_point` of ``cameras``,
+        which leaves them outside; without points, or where these are few, the cube."""
         center, _ = focus_point(cameras)
         half = _SIZE * max(min(np.linalg.norm(c.origin - center) for c in cameras), 1e-3)
-        return cls.of([*(center - half), *(center + half)])
+        lower, upper = center - half, center + half
+        if points is not None:
+            inside = points[((points > lower) & (points < upper)).all(1)]
+            if len(inside) >= _FEW:
+                least, most = np.percentile(inside, [_OUTLIERS, 100 - _OUTLIERS], axis=0)
+                room = _MARGIN * (most - least).max()
+                lower, upper = np.maximum(lower, least - room), np.minimum(upper, most + room)
+        return cls.of([*lower, *upper])
 
     @property
     def center(self) -> np.ndarray:

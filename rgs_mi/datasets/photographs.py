@@ -13,19 +13,21 @@ from ..core.color import display
 from .images import resize
 from .types import DepthPrior, View
 
+MOST_PIXELS = 640_000  # that a step looks at: of larger windows one tile at a time, so that its memory is bounded
 _CROP_MARGIN = 8  # pixels of background around the object that training looks at
 
 
 @dataclass(frozen=True)
 class Photograph:
-    """One photograph, or the window of it around the object, with one entry per pixel.
+    """One photograph, or a tile of the window of it around the object, with one entry per pixel.
 
-    camera   that of the window
+    camera   that of the tile
     color    display values over the background
     alpha    coverage
     prior    depth up to scale and shift, NaN where unknown; or None
     inverse  whether the prior is one of inverse depth
     size     (width, height) of the whole photograph
+    window   that of the window
     """
 
     camera: Camera
@@ -34,11 +36,18 @@ class Photograph:
     prior: "mi.Float | None"
     inverse: bool
     size: tuple[int, int]
+    window: tuple[int, int]
+
+    @property
+    def part(self) -> float:
+        """The part of the window's pixels that the tile has."""
+        return float(np.prod(self.camera.size) / np.prod(self.window))
 
 
 class Photographs:
     """The training photographs of one pyramid level as the losses want them: display space, over the background, and
-    cropped to windows of one size that hold the object in every view (one size, since each needs its own kernels).
+    cropped to windows of one size that hold the object in every view (one size, since each needs its own kernels), or, of
+    windows of more than `MOST_PIXELS`, to tiles of one size.
 
     ``downscale`` is how many pixels of a view's side make one of the level's; ``background`` a display value; ``priors`` has
     one entry per view.
@@ -55,23 +64,26 @@ class Photographs:
         self._images = {}
         self._windows = _windows(views, downscale)
 
-    def __getitem__(self, i: int) -> Photograph:
-        """The photograph of view ``i``."""
-        camera, (x, y, width, height) = self.views[i].camera, self._windows[i]
+    def tile(self, i: int, turn: int = 0) -> Photograph:
+        """Return what a step looks at of view ``i``: its window, or one of the tiles of it, whose ``turn`` it is."""
+        camera, (x, y, *window) = self.views[i].camera, self._windows[i]
         if i not in self._images:
             whole = self._whole(i)
-            window = whole[y : y + height, x : x + width].transpose(2, 0, 1).reshape(whole.shape[2], -1)
+            planes = whole[y : y + window[1], x : x + window[0]].transpose(2, 0, 1)
             # Half precision keeps colours; of depths it would make steps.
-            self._images[i] = window[:4].astype(np.float16), window[4:].copy(), whole.shape[1::-1]
+            self._images[i] = planes[:4].astype(np.float16), planes[4:].copy(), whole.shape[1::-1]
         color, depth, size = self._images[i]
-        planes = [as_float(plane) for plane in color]
+        left, top, width, height = _tile(window, turn)
+        flat = lambda planes: [as_float(p.ravel()) for p in planes[:, top : top + height, left : left + width]]
+        planes, prior = flat(color), flat(depth)
         return Photograph(
-            camera.resized(*size).cropped(x, y, width, height),
+            camera.resized(*size).cropped(x + left, y + top, width, height),
             mi.Color3f(*planes[:3]) + self.background * (1 - planes[3]),
             planes[3],
-            as_float(depth) if len(depth) else None,
+            prior[0] if prior else None,
             bool(self.priors and self.priors[i].inverse),
             size,
+            (window[0], window[1]),
         )
 
     def _whole(self, i):
@@ -97,6 +109,19 @@ def _windows(views, downscale):
     size = np.minimum(np.ceil(wanted / 8) * 8, sizes[0]).astype(int)
     corners = np.clip(np.round((boxes[:, :2] + boxes[:, 2:] - size) / 2), 0, sizes[0] - size).astype(int)
     return [(int(x), int(y), int(size[0]), int(size[1])) for x, y in corners]
+
+
+def _tile(window, turn):
+    """(x, y, width, height) of the tile of a ``window`` (width, height) whose ``turn`` it is: the window where it is small
+    enough, else one of a grid of equal tiles, which overlap."""
+    width, height = window
+    columns, rows = 1, 1
+    while width * height > MOST_PIXELS * columns * rows:
+        columns, rows = (columns + 1, rows) if width * rows >= height * columns else (columns, rows + 1)
+    size = -(-width // columns), -(-height // rows)
+    row, column = divmod(turn % (columns * rows), columns)
+    place = lambda k, n, whole, part: round(k * (whole - part) / max(n - 1, 1))
+    return place(column, columns, width, size[0]), place(row, rows, height, size[1]), *size
 
 
 def shrink(image: np.ndarray, factor: int) -> np.ndarray:

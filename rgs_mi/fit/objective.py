@@ -68,7 +68,8 @@ class Objective:
             terms["distortion"] = w.distortion * losses.distortion(maps, self.extent)
         weight = dr.opaque(mi.Float, consistency)
         terms["consistency"] = weight * losses.depth_normal_consistency(image.gbuffer, photo.camera)
-        part_of_image = size[0] * size[1] / (photo.size[0] * photo.size[1])  # these are means over the whole photograph
+        # These are means over the whole photograph, of which tiles give an estimate
+        part_of_image = photo.window[0] * photo.window[1] / (photo.size[0] * photo.size[1])
         terms = {name: part_of_image * term for name, term in terms.items()}
         error = dr.mean(dr.mean(dr.square(dr.detach(rendered) - photo.color))) * part_of_image
         regional, reflective = self._regional(image.gbuffer, photo, step)

@@ -52,7 +52,7 @@ def told(settings: Settings, dataset: Dataset) -> str:
         "cameras": settings.cameras,
         "exposure": settings.exposure,
         "density.max_surfels": settings.density.max_surfels,
-    }
+    } | ({} if settings.box is None else {"box": "[" + ", ".join(f"{v:.3g}" for v in settings.box) + "]"})
     return (
         f"{len(dataset.train)} {kind} of {width} x {height} pixels, {masks}, and {len(dataset.test)} held out: "
         + ", ".join(f"{name}={value}" for name, value in chosen.items())
@@ -62,7 +62,7 @@ def told(settings: Settings, dataset: Dataset) -> str:
 
 def agree(asked: Mapping, saved: Mapping) -> bool:
     """Return whether the settings ``saved`` with a fit, nested dicts, are those ``asked`` for, but for what they leave open."""
-    open_ = lambda tree: (tree["density"]["max_surfels"], tree["initialization"]["surfels"], tree["stages"])
+    open_ = lambda tree: (tree["density"]["max_surfels"], tree["initialization"]["surfels"], tree["stages"], tree["box"])
     try:
         chosen = [there if own is None else own for own, there in zip(open_(asked), open_(saved))]
     except (KeyError, TypeError):
@@ -72,6 +72,7 @@ def agree(asked: Mapping, saved: Mapping) -> bool:
         "density": {**asked["density"], "max_surfels": chosen[0]},
         "initialization": {**asked["initialization"], "surfels": chosen[1]},
         "stages": chosen[2],
+        "box": chosen[3],
     }
 
 

@@ -250,7 +250,7 @@ class Fit:
     def _view(self, i, surfels, lighting, weight):
         """Accumulate the gradients of view ``i``; returns its loss's terms and the mean squared ``error``."""
         assert self.photographs is not None
-        photo, gain, terms = self.photographs[i], None, {}
+        photo, gain, terms = self.photographs.tile(i, self.views_used // len(self.dataset.train) + i), None, {}
         if self.cameras:
             started = self.schedule.learns_cameras(self.progress)
             seen = self.cameras.see(i, photo.camera, self.settings.weights, started)
@@ -262,7 +262,8 @@ class Fit:
         loss = self.objective(image, photo, self.dataset.train[i].masked, consistency, self.step_number, gain)
         terms |= loss.terms
         dr.backward(sum(terms.values()) * weight)
-        self.density.gradients.add(dr.grad(means2d_offset) / weight, image.gbuffer.seen, photo.size)
+        gradient = dr.grad(means2d_offset) * (photo.part / weight)  # as if all of the window had been seen
+        self.density.gradients.add(gradient, image.gbuffer.seen, photo.size)
         if loss.reflective is not None:
             self.density.note_reflective(i, photo.camera, loss.reflective)
         return dr.detach(terms) | {"error": loss.error}

@@ -269,8 +269,8 @@ def verified(maps: Sequence[DepthMap]) -> list[DepthMap]:
 
 
 def agreement(points: np.ndarray, maps: Sequence[DepthMap]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return how many of ``maps`` have a surface at each of ``points`` [N, 3], and the sums of the likeness of these, and of those
-    that look through it at something farther, [N] each."""
+    """Return how many of ``maps`` have a surface at each of ``points`` [N, 3], and the sums of the likeness of these, and of
+    those that look through it at something farther, [N] each."""
     if not len(points):
         return np.zeros(0), np.zeros(0), np.zeros(0)
     p = mi.Point3f(*(as_float(np.ascontiguousarray(x)) for x in np.asarray(points, np.float32).T))

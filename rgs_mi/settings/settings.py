@@ -216,7 +216,8 @@ class Settings:
     box: tuple[float, float, float, float, float, float] | None = Field(
         default=None,
         description="Lower and upper corner of the box around the object, in captures without masks: what reflects. Unless "
-        "given, it is half as far from the point that the cameras look at as the nearest of them.",
+        "given, it is that of the first points that are at most half as far from the point that the cameras look at as the "
+        "nearest of them.",
     )
     reflective: float = Field(
         default=0.9, ge=0, le=1, description="The fraction of a view's foreground, smoothest first, that is reflective."

@@ -44,6 +44,16 @@ def test_found_from_cameras():
     assert larger.radius == pytest.approx(2 * box.radius, rel=0.1)
 
 
+def test_found_from_points():
+    """Those near what the cameras look at, less stray ones; what lies far away, and few points, change nothing."""
+    cube, rng = BoundingBox.seen_by(cameras()), np.random.default_rng(0)
+    near, far = rng.uniform((-0.5, -0.2, 0), (0.5, 0.2, 0.4), (2000, 3)), rng.uniform(20, 30, (500, 3))
+    box = BoundingBox.seen_by(cameras(), np.concatenate([near, far, [[1.4, 1.4, 1.4]]]))
+    np.testing.assert_allclose(box.min, (-0.6, -0.3, -0.1), atol=0.02)
+    np.testing.assert_allclose(box.max, (0.6, 0.3, 0.5), atol=0.02)
+    assert BoundingBox.seen_by(cameras(), near[:20]) == BoundingBox.seen_by(cameras(), far) == cube
+
+
 @pytest.mark.parametrize("numbers", [(0, 0, 0, 1, 1), (0, 0, 0, 1, 0, 1), (0, 0, 0, 1, 1, float("inf"))])
 def test_six_numbers(numbers):
     with pytest.raises(ValueError, match="a box is six numbers"):

@@ -192,7 +192,7 @@ def test_poses_and_exposures_come_back():
     before = pose_errors(cameras.given, truth)
     for rate in schedule:
         for view in range(6):
-            photo = photographs[view]
+            photo = photographs.tile(view)
             s = cameras.see(view, photo.camera, SETTINGS.weights)
             image = deferred.render(surfels, s.camera, lighting)
             shown = losses.display(image.color * s.gain, image.gbuffer.all.alpha, 1.0)

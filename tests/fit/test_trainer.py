@@ -36,7 +36,7 @@ def test_crops_hold_the_object_and_their_cameras_fit(dataset, downscale):
     lighting = Lighting(SplitSum(model().environment().filtered()))
     surfels = Surfels.from_numpy(surfels.numpy(), two_sided=False)
     for i, view in enumerate(dataset.train):
-        photo = photographs[i]
+        photo = photographs.tile(i)
         alpha = photo.alpha
         sizes.add(photo.camera.size)
         assert photo.size == tuple(n // downscale for n in view.camera.size)
@@ -53,11 +53,49 @@ def test_priors_are_cropped_like_photographs(dataset, downscale):
     """A prior that is the mask itself, with a hole."""
     values = [np.where(v.pixels[..., 3] > 127, v.pixels[..., 3] / 255, np.nan).astype(np.float32) for v in dataset.train]
     photographs = Photographs(dataset.train, downscale, 1.0, [DepthPrior(v, inverse=True) for v in values])
-    photo = photographs[2]
+    photo = photographs.tile(2)
     prior, alpha = photo.prior.numpy(), photo.alpha.numpy()
     assert photo.inverse and prior.shape == alpha.shape and np.isnan(prior[alpha < 0.2]).all()
     assert np.abs(prior - alpha)[(alpha > 0.9) & np.isfinite(prior)].max() < 0.2
-    assert Photographs(dataset.train, downscale, 1.0)[2].prior is None
+    assert Photographs(dataset.train, downscale, 1.0).tile(2).prior is None
+
+
+def test_tiles_of_a_large_window_estimate_it(dataset, monkeypatch):
+    """Turn by turn they cover it, through cameras of their own; the mean of their losses, and of the gradients that density
+    control takes, are those of the whole."""
+    weights = Weights(dssim=0, consistency=(0, 0), normal=0, minimum_variation=0)  # what is a mean over pixels
+    settings = replace(SETTINGS, weights=weights)
+    fit, view = Fit(dataset, model(), settings, 1.0), 3
+    fit.photographs = Photographs(dataset.train, 1, 1.0)
+    (width, height), whole = fit.photographs.tile(view).camera.size, fit.photographs.tile(view)
+    rays = whole.camera.rays().reshape(height, width, 3)
+    color = np.array(whole.color).T.reshape(height, width, 3)
+
+    def measured():
+        fit.density = type(fit.density)(settings.density, 1.0, None, len(fit.model))
+        loss = fit._view(view, fit.model.surfels(0), None, 1.0)
+        return float(loss["loss.photometric"][0]), float(loss["error"][0]), fit.density.gradients.sum.numpy()
+
+    expected = measured()
+    monkeypatch.setattr("rgs_mi.datasets.photographs.MOST_PIXELS", width * height // 3)
+    covered, found = np.zeros((height, width), int), []
+    for turn in range(4):
+        tile = fit.photographs.tile(view, turn)
+        w, h = tile.camera.size
+        corner = np.abs(rays - tile.camera.rays()[0, 0]).sum(-1).argmin()
+        top, left = divmod(corner, width)
+        covered[top : top + h, left : left + w] += 1
+        np.testing.assert_allclose(tile.camera.rays(), rays[top : top + h, left : left + w], atol=1e-6)
+        np.testing.assert_allclose(np.array(tile.color).T.reshape(h, w, 3), color[top : top + h, left : left + w], atol=1e-6)
+        assert tile.part == w * h / (width * height) < 1 / 2
+        fit.views_used = turn * len(dataset.train)
+        found.append(measured())
+    assert covered.min() == 1 and (covered > 1).mean() < 0.1
+    for k in range(2):
+        assert np.mean([f[k] for f in found]) == pytest.approx(expected[k], rel=0.1)
+    total = np.sum([f[2] for f in found], 0)
+    strong = expected[2] > np.percentile(expected[2], 50)
+    assert np.median(total[strong] / expected[2][strong]) == pytest.approx(1, abs=0.1)
 
 
 def test_a_fit_gets_better(dataset):
