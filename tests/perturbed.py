@@ -53,6 +53,7 @@ def main():
         if args.clean
         else perturbed(truth, seed=args.seed, dilation=args.dilation if args.dilation >= 0 else None)
     )
+    dataset = replace(dataset, test=truth.test)  # what is judged is what came out, by clean photographs
     cameras = [view.camera for view in truth.train]
     center, _ = focus_point(cameras)
     distance = float(np.mean([np.linalg.norm(c.origin - center) for c in cameras]))

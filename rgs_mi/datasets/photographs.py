@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
+from scipy import ndimage
 from skimage.transform import downscale_local_mean
 
 from ..core.arrays import as_float
@@ -22,8 +23,9 @@ class Photograph:
     """One photograph, or a tile of the window of it around the object, with one entry per pixel.
 
     camera   that of the tile
-    color    display values over the background
+    color    display values over what lies behind
     alpha    coverage
+    behind   display values of what lies behind the object
     prior    depth up to scale and shift, NaN where unknown; or None
     inverse  whether the prior is one of inverse depth
     size     (width, height) of the whole photograph
@@ -33,6 +35,7 @@ class Photograph:
     camera: Camera
     color: "mi.Color3f"
     alpha: "mi.Float"
+    behind: "mi.Color3f"
     prior: "mi.Float | None"
     inverse: bool
     size: tuple[int, int]
@@ -50,7 +53,8 @@ class Photographs:
     windows of more than `MOST_PIXELS`, to tiles of one size.
 
     ``downscale`` is how many pixels of a view's side make one of the level's; ``background`` a display value; ``priors`` has
-    one entry per view.
+    one entry per view. Where masks may be wrong, within ``tolerance`` pixels of a view from their borders, the photograph
+    itself is what lies behind: a surface that looks different does not belong there, and transparency costs nothing.
     """
 
     def __init__(
@@ -59,40 +63,62 @@ class Photographs:
         downscale: int,
         background: float,
         priors: Sequence[DepthPrior] | None = None,
+        tolerance: int = 0,
     ) -> None:
         self.views, self.downscale, self.background, self.priors = views, downscale, background, priors
+        self.tolerance = tolerance
         self._images = {}
         self._windows = _windows(views, downscale)
+
+    @property
+    def window(self) -> tuple[int, int]:
+        """(width, height) of the windows."""
+        return self._windows[0][2:]
 
     def tile(self, i: int, turn: int = 0) -> Photograph:
         """Return what a step looks at of view ``i``: its window, or one of the tiles of it, whose ``turn`` it is."""
         camera, (x, y, *window) = self.views[i].camera, self._windows[i]
         if i not in self._images:
-            whole = self._whole(i)
-            planes = whole[y : y + window[1], x : x + window[0]].transpose(2, 0, 1)
+            images, prior = self._images_of(i)
+            cut = lambda image: image[y : y + window[1], x : x + window[0]].transpose(2, 0, 1)
             # Half precision keeps colours; of depths it would make steps.
-            self._images[i] = planes[:4].astype(np.float16), planes[4:].copy(), whole.shape[1::-1]
-        color, depth, size = self._images[i]
+            self._images[i] = cut(images).astype(np.float16), cut(prior).copy(), images.shape[1::-1]
+        images, prior, size = self._images[i]
         left, top, width, height = _tile(window, turn)
         flat = lambda planes: [as_float(p.ravel()) for p in planes[:, top : top + height, left : left + width]]
-        planes, prior = flat(color), flat(depth)
+        planes, depth = flat(images), flat(prior)
         return Photograph(
             camera.resized(*size).cropped(x + left, y + top, width, height),
-            mi.Color3f(*planes[:3]) + self.background * (1 - planes[3]),
+            mi.Color3f(*planes[:3]),
             planes[3],
-            prior[0] if prior else None,
+            mi.Color3f(*planes[4:] or [self.background]),
+            depth[0] if depth else None,
             bool(self.priors and self.priors[i].inverse),
             size,
             (window[0], window[1]),
         )
 
-    def _whole(self, i):
-        """[H, W, 4 or 5] of this level: colour, coverage and, where there is one, the prior."""
+    def _images_of(self, i):
+        """Of this level: colour, coverage and, where that is no grey level, what lies behind, [H, W, 4 or 7]; and the prior
+        [H, W, 1], or [H, W, 0] where there is none."""
         view = self.views[i]
-        whole = shrink(np.concatenate([display(view.pixels, 0.0), view.alpha[..., None]], 2), self.downscale)
+        images = [display(view.pixels, self.background), view.alpha[..., None]]
+        if self.tolerance and view.masked:
+            opaque = view.pixels.copy()
+            opaque[..., 3] = 255 if opaque.dtype == np.uint8 else 1
+            near, shown = _border(view.alpha > 0.5, self.tolerance)[..., None], display(opaque, 0.0)
+            images[0] = np.where(near, shown, images[0])
+            images.append(np.where(near, shown, np.float32(self.background)))
+        images = shrink(np.concatenate(images, 2), self.downscale)
         if self.priors is None:
-            return whole
-        return np.concatenate([whole, resize(self.priors[i].values, *whole.shape[:2])[..., None]], 2)
+            return images, images[..., :0]
+        return images, resize(self.priors[i].values, *images.shape[:2])[..., None]
+
+
+def _border(mask, distance):
+    """Of which pixels of a ``mask`` [H, W] another is not as they are, so many pixels away, or fewer, along both sides."""
+    size = 2 * distance + 1
+    return ndimage.maximum_filter(mask, size) != ndimage.minimum_filter(mask, size)
 
 
 def _windows(views, downscale):
@@ -111,13 +137,18 @@ def _windows(views, downscale):
     return [(int(x), int(y), int(size[0]), int(size[1])) for x, y in corners]
 
 
-def _tile(window, turn):
-    """(x, y, width, height) of the tile of a ``window`` (width, height) whose ``turn`` it is: the window where it is small
-    enough, else one of a grid of equal tiles, which overlap."""
-    width, height = window
-    columns, rows = 1, 1
+def tiling(window: tuple[int, int]) -> tuple[int, int]:
+    """Return into how many (columns, rows) of tiles a ``window`` (width, height) falls, of `MOST_PIXELS` at most."""
+    (width, height), columns, rows = window, 1, 1
     while width * height > MOST_PIXELS * columns * rows:
         columns, rows = (columns + 1, rows) if width * rows >= height * columns else (columns, rows + 1)
+    return columns, rows
+
+
+def _tile(window, turn):
+    """(x, y, width, height) of the tile of a ``window`` (width, height) whose ``turn`` it is: one of a grid of equal tiles,
+    which overlap."""
+    (width, height), (columns, rows) = window, tiling(window)
     size = -(-width // columns), -(-height // rows)
     row, column = divmod(turn % (columns * rows), columns)
     place = lambda k, n, whole, part: round(k * (whole - part) / max(n - 1, 1))

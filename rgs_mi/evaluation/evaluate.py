@@ -19,7 +19,7 @@ from ..splat.tiles import TILE
 from ..surfels.surfels import Surfels
 from . import lpips, metrics
 
-_MOST_SAMPLES = 1 << 20  # of a rendering that is in memory at once
+_MOST_SAMPLES = 1 << 19  # of a rendering that is in memory at once
 #: Scores of one view; the mean over views has the same names.
 SCORES = ("psnr", "ssim", "lpips", "lpips_alex", "normal_mae_deg", "normal_ssim", "normal_lpips")
 

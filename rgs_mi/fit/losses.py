@@ -24,8 +24,8 @@ def srgb(x: "mi.Color3f") -> "mi.Color3f":
     return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * dr.power(dr.maximum(x, 0.0031308), 1 / 2.4) - 0.055)
 
 
-def display(color: "mi.Color3f", alpha: "mi.Float", background: float) -> "mi.Color3f":
-    """Composite premultiplied linear ``color`` over ``background``, a display-space grey level, in display space, as data
+def display(color: "mi.Color3f", alpha: "mi.Float", background: "float | mi.Color3f") -> "mi.Color3f":
+    """Composite premultiplied linear ``color`` over ``background``, of display values, in display space, as data
     sets with straight alpha are: srgb(color / alpha) alpha + background (1 − alpha)."""
     covered = alpha > COVERED
     safe = dr.select(covered, alpha, 1)

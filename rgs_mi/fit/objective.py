@@ -58,7 +58,7 @@ class Objective:
         """
         w, maps, size = self.settings.weights, image.gbuffer.all, photo.camera.size
         color = image.color if gain is None else image.color * gain
-        rendered = losses.display(color, maps.alpha, self.settings.background)
+        rendered = losses.display(color, maps.alpha, photo.behind)
         terms = {"photometric": losses.photometric(rendered, photo.color, size, w.dssim)}
         if w.mask > 0 and masked:
             terms["mask"] = w.mask * losses.mask(maps.alpha, photo.alpha)

@@ -13,7 +13,7 @@ _SURFELS, _SURFELS_A_MINUTE = 50_000, (5_000, 15_000)  # at least; a minute at l
 _FIRST = 25_000  # surfels to start with, at least
 _COARSEST, _FINEST_FROM = 200, 0.2  # pixels along the longer side, about; the part of the fit before full resolution
 STEPS = 500, 1000  # of a level before the next: of one below half resolution, and of that
-LAST = 0.25  # of the fit: there half as fine is not fine enough, if every view can be seen once more
+LAST = 0.4  # of the fit: there half as fine is not fine enough, if every view can be seen once more
 LEAST_STEPS = 250, 1000  # that there must be time for at the next: at half resolution and below, and at full resolution
 
 

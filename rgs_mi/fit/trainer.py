@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import as_float
-from ..datasets.photographs import Photographs
+from ..datasets.photographs import Photographs, tiling
 from ..datasets.types import Dataset, DepthPrior
 from ..settings.settings import Settings, Stage
 from ..shading import deferred
@@ -120,16 +120,22 @@ class Fit:
     @property
     def stage(self) -> Stage:
         """The level of the pyramid in use: that of the schedule; in a fit that minutes bound, level by level, each after
-        `STEPS` of the one before, and if there is time for `LEAST_STEPS`, or in its last part (`LAST`) for every view once."""
+        `STEPS` of the one before and if there is time for `LEAST_STEPS`; or, in its last part (`LAST`), for all of every view
+        once."""
         planned, now, s = self.schedule.stage(self.progress), self._level, self.settings
         if now is None or s.iterations or s.minutes is None or planned.downscale >= now.stage.downscale:
             return planned
+        if self.photographs is None:
+            return now.stage
         finer = max((stage for stage in s.stages or () if stage.downscale < now.stage.downscale), key=lambda x: x.downscale)
-        pixels = (now.stage.downscale / finer.downscale) ** 2 * finer.views / now.stage.views
-        last = finer.downscale == 1  # it costs most, and shows least
-        least = len(self.dataset.train) if self.progress > 1 - LAST else LEAST_STEPS[last]
-        affordable = 60 * s.minutes - self.elapsed > least * pixels * np.median(now.seconds)
-        return finer if affordable and now.steps >= STEPS[last] else now.stage
+        scale = now.stage.downscale / finer.downscale
+        width, height = self.photographs.window
+        tiles = [np.prod(tiling((width * f, height * f))) for f in (1, scale)]  # of a view, now and then
+        seconds = scale**2 * tiles[0] / tiles[1] * finer.views / now.stage.views * np.median(now.seconds)
+        full, late = finer.downscale == 1, self.progress > 1 - LAST  # which costs most, and shows least
+        least = len(self.dataset.train) * tiles[1] / finer.views if late else LEAST_STEPS[full]
+        affordable = 60 * s.minutes - self.elapsed > least * seconds
+        return finer if affordable and (late or now.steps >= STEPS[full]) else now.stage
 
     @property
     def sh_order(self) -> int:
@@ -187,7 +193,9 @@ class Fit:
         if self._level is None or stage != self._level.stage:
             self._level = _Level(stage)
         if self.photographs is None or self.photographs.downscale != stage.downscale:
-            self.photographs = Photographs(self.dataset.train, stage.downscale, self.settings.background, self.priors)
+            s = self.settings
+            self.photographs = Photographs(self.dataset.train, stage.downscale, s.background, self.priors, s.mask_tolerance)
+            dr.flush_malloc_cache()  # of arrays of sizes that do not come again
         self._follow_schedule()
         views = self._next_views(stage.views)
         surfels = self.model.surfels(self.sh_order)

@@ -48,6 +48,7 @@ def write(fit: "Fit", scene: "FitScene", folder: Path, quiet: bool) -> None:
     Raises: UserError where the disk is full or the folder can't be written.
     """
     facts = _facts(fit)  # the peak of memory is the fit's, not that of its evaluation
+    dr.flush_malloc_cache()
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
         lighting = fit.lighting(surfels)

@@ -201,6 +201,13 @@ class Settings:
     background: float = Field(
         default=1.0, ge=0, le=1, description="Display grey level behind masked objects, in training and in figures."
     )
+    mask_tolerance: int = Field(
+        default=0,
+        ge=0,
+        le=100,
+        description="Pixels of a photograph that its mask may be off by: that near its border, what the photograph shows lies "
+        "behind the object.",
+    )
     specular_start: float = Field(
         default=0.0, ge=0, le=1, description="Fraction of the fit from which reflections are shaded; 1 means never."
     )

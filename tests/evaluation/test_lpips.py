@@ -131,6 +131,17 @@ def test_bands_do_not_show(weights, monkeypatch):
     assert lpips.distance(a, b) == pytest.approx(truth, rel=1e-5)
 
 
+@pytest.mark.parametrize("network", SIZES)
+@pytest.mark.parametrize("height", [400, 401, 415])
+def test_strips_do_not_show(weights, monkeypatch, network, height):
+    rng = np.random.default_rng(height)
+    a = rng.random((height, 37, 3))
+    b = np.clip(a + rng.normal(0, 0.1, a.shape) * np.linspace(0, 1, height)[:, None, None], 0, 1)
+    truth = lpips.distance(a, b, network)
+    monkeypatch.setattr(lpips, "_STRIP", 37 * 50)
+    assert lpips.distance(a, b, network) == pytest.approx(truth, rel=1e-5)
+
+
 @pytest.mark.parametrize("network, size", [("vgg", 16), ("alex", 31)])
 def test_smallest_image(weights, network, size):
     image = np.random.default_rng(0).random((size, 64, 3))

@@ -4,17 +4,12 @@ from dataclasses import replace
 
 import pytest
 
-from rgs_mi.fit.plan import agree, planned, told
-from rgs_mi.fit.trainer import LEAST_STEPS, STEPS, Fit
+from rgs_mi.fit.plan import LAST, LEAST_STEPS, STEPS, agree, planned, told
+from rgs_mi.fit.trainer import Fit
 from rgs_mi.settings.config import to_dict
 from rgs_mi.settings.settings import Density, Initialization, Settings, Stage
 
-from fits import SETTINGS, model, random_photographs
-
-
-@pytest.fixture(scope="module")
-def dataset():
-    return random_photographs()
+from fits import SETTINGS, model
 
 
 def with_pixels(dataset, count):
@@ -64,7 +59,7 @@ def test_what_is_decided_is_told(dataset):
     assert "5 of them with masks" in told(planned(Settings(), dataset), replace(dataset, train=some))
 
 
-def test_levels_wait_for_steps_and_time(dataset):
+def test_levels_wait_for_steps_and_time(dataset, monkeypatch):
     """However fast or slow steps are: none is left early, and none begun that there is no time for."""
     stages = (Stage(0.1, 4, 1), Stage(0.2, 2, 1), Stage(1.0, 1, 1))
     fit = Fit(dataset, model(), replace(SETTINGS, iterations=None, minutes=1.0, stages=stages), 1.0)
@@ -80,3 +75,24 @@ def test_levels_wait_for_steps_and_time(dataset):
     level.seconds.clear()
     level.seconds.append(47.0 / LEAST_STEPS[0] / 3.9)
     assert fit.stage.downscale == 4, "no time for it"
+    width, height = fit.photographs.window
+    monkeypatch.setattr("rgs_mi.datasets.photographs.MOST_PIXELS", width * height)
+    assert fit.stage.downscale == 2, "four tiles: steps take no longer"
+    level.seconds.clear()
+    level.seconds.append(47.0 / LEAST_STEPS[0] * 1.1)
+    assert fit.stage.downscale == 4, "no time for it"
+
+
+def test_the_last_part_is_finer_if_all_views_have_their_turn(dataset):
+    stages = (Stage(0.1, 2, 1), Stage(1.0, 1, 1))
+    fit = Fit(dataset, model(), replace(SETTINGS, iterations=None, minutes=1.0, stages=stages), 1.0)
+    fit.step()
+    fit._level.seconds.clear()
+    fit._level.seconds.append(0.1)
+    fit.elapsed = 60 * (1 - LAST) - 1
+    assert fit.stage.downscale == 2, "too few steps"
+    fit.elapsed = 60 * (1 - LAST) + 1
+    assert fit.stage.downscale == 1
+    fit._level.seconds.clear()
+    fit._level.seconds.append(LAST * 60 / (4 * len(dataset.train)))
+    assert fit.stage.downscale == 2, "no time for every view"

@@ -7,6 +7,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from rgs_mi.commands.optimize import start
 from rgs_mi.core.arrays import as_float
@@ -58,6 +59,25 @@ def test_priors_are_cropped_like_photographs(dataset, downscale):
     assert photo.inverse and prior.shape == alpha.shape and np.isnan(prior[alpha < 0.2]).all()
     assert np.abs(prior - alpha)[(alpha > 0.9) & np.isfinite(prior)].max() < 0.2
     assert Photographs(dataset.train, downscale, 1.0).tile(2).prior is None
+
+
+def test_masks_that_may_be_wrong_show_what_lies_behind(dataset):
+    """Near their borders the photograph itself; farther away what is opaque, or the background."""
+    view = dataset.train[1]
+    view = replace(view, pixels=np.where(view.pixels[..., 3:] > 127, view.pixels, np.uint8([9, 90, 200, 0])))
+    exact, photo = (Photographs([view], 1, 1.0, tolerance=t).tile(0) for t in (0, 3))
+    width, height = photo.camera.size
+    image = lambda value: np.array(value).T.reshape(height, width, 3)
+    mask = exact.alpha.numpy().reshape(height, width) > 0.5
+    away = np.where(mask, *(ndimage.distance_transform_cdt(m, "chessboard") for m in (mask, ~mask)))
+    assert (np.array(exact.behind) == 1).all() and np.abs(image(exact.color)[~mask] - 1).max() == 0
+    near = away <= 3
+    np.testing.assert_array_equal(image(photo.behind)[near], image(photo.color)[near])
+    np.testing.assert_allclose(image(photo.color)[near & ~mask] * 255, [[9, 90, 200]] * (near & ~mask).sum(), atol=0.1)
+    np.testing.assert_array_equal(image(photo.color)[~near], image(exact.color)[~near])
+    assert (image(photo.behind)[~near] == 1).all() and (photo.alpha.numpy() == exact.alpha.numpy()).all()
+    whole = replace(view, masked=False)
+    assert (Photographs([whole], 1, 0.5, tolerance=3).tile(0).behind.x.numpy() == 0.5).all()
 
 
 def test_tiles_of_a_large_window_estimate_it(dataset, monkeypatch):
