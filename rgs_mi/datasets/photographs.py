@@ -73,7 +73,8 @@ class Photographs:
     @property
     def window(self) -> tuple[int, int]:
         """(width, height) of the windows."""
-        return self._windows[0][2:]
+        _, _, width, height = self._windows[0]
+        return width, height
 
     def tile(self, i: int, turn: int = 0) -> Photograph:
         """Return what a step looks at of view ``i``: its window, or one of the tiles of it, whose ``turn`` it is."""

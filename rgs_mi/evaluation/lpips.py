@@ -83,9 +83,9 @@ def _strip(images, first, last, network):
             maps, stride = _maximum(maps, window), 2 * stride
         for convolution in convolutions:
             maps, stride = _convolution(maps, *convolution), convolution[2] * stride
-        index = maps.index[:, (first - top) // stride : (last - top) // stride if last < images.shape[1] else None]
-        sums.append(_difference(maps.values, *index, weight))
-        counts.append(index[0].size)
+        a, b = maps.index[:, (first - top) // stride : (last - top) // stride if last < images.shape[1] else None]
+        sums.append(_difference(maps.values, a, b, weight))
+        counts.append(a.size)
     return sums, counts
 
 

@@ -13,18 +13,18 @@ _SURFELS, _SURFELS_A_MINUTE = 50_000, (5_000, 15_000)  # at least; a minute at l
 _FIRST = 25_000  # surfels to start with, at least
 _COARSEST, _FINEST_FROM = 200, 0.2  # pixels along the longer side, about; the part of the fit before full resolution
 STEPS = 500, 1000  # of a level before the next: of one below half resolution, and of that
-LAST = 0.4  # of the fit: there half as fine is not fine enough, if every view can be seen once more
+LAST = 0.25  # of the fit: there half as fine is not fine enough, if every view can be seen once more
 LEAST_STEPS = 250, 1000  # that there must be time for at the next: at half resolution and below, and at full resolution
 
 
 def planned(settings: Settings, dataset: Dataset) -> Settings:
     """Return ``settings`` with numbers where they leave open what suits the photographs of ``dataset``:
 
-    density.max_surfels     as many as a photograph shows pixels of the object, in the mean; but 15 000 a minute at most, and
-                            50 000, and 5000 a minute, at least
-    initialization.surfels  half of these, 25 000 at least
-    stages                  halves of halves down to some 200 pixels; from 20 % of the fit on all pixels, from 10 % on half of
-                            them along a side, and so on
+    - `density.max_surfels`: as many as a photograph shows pixels of the object, in the mean; but 15 000 a minute at most, and
+      50 000, and 5000 a minute, at least;
+    - `initialization.surfels`: half of these, 25 000 at least;
+    - `stages`: halves of halves down to some 200 pixels; from 20 % of the fit on all pixels, from 10 % on half of them along
+      a side, and so on.
     """
     density, first = settings.density, settings.initialization.surfels
     if (most := density.max_surfels) is None:

@@ -120,8 +120,7 @@ class Fit:
     @property
     def stage(self) -> Stage:
         """The level of the pyramid in use: that of the schedule; in a fit that minutes bound, level by level, each after
-        `STEPS` of the one before and if there is time for `LEAST_STEPS`; or, in its last part (`LAST`), for all of every view
-        once."""
+        `STEPS` of the one before, and if there is time for `LEAST_STEPS` or, in its last part (`LAST`), for every view once."""
         planned, now, s = self.schedule.stage(self.progress), self._level, self.settings
         if now is None or s.iterations or s.minutes is None or planned.downscale >= now.stage.downscale:
             return planned
@@ -130,12 +129,12 @@ class Fit:
         finer = max((stage for stage in s.stages or () if stage.downscale < now.stage.downscale), key=lambda x: x.downscale)
         scale = now.stage.downscale / finer.downscale
         width, height = self.photographs.window
-        tiles = [np.prod(tiling((width * f, height * f))) for f in (1, scale)]  # of a view, now and then
+        tiles = [np.prod(tiling((round(width * f), round(height * f)))) for f in (1, scale)]  # of a view, now and then
         seconds = scale**2 * tiles[0] / tiles[1] * finer.views / now.stage.views * np.median(now.seconds)
-        full, late = finer.downscale == 1, self.progress > 1 - LAST  # which costs most, and shows least
-        least = len(self.dataset.train) * tiles[1] / finer.views if late else LEAST_STEPS[full]
+        full = finer.downscale == 1  # which costs most, and shows least
+        least = LEAST_STEPS[full] if self.progress <= 1 - LAST else len(self.dataset.train) * tiles[1] / finer.views
         affordable = 60 * s.minutes - self.elapsed > least * seconds
-        return finer if affordable and (late or now.steps >= STEPS[full]) else now.stage
+        return finer if affordable and now.steps >= STEPS[full] else now.stage
 
     @property
     def sh_order(self) -> int:

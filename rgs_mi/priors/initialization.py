@@ -42,9 +42,10 @@ def initial_points(
         if on_hull:
             return _on_hull(views, count, rng, compare, len(views) // _A_WRONG_MASK if dataset.photographed else 0, quiet)
     elif compare:
-        positions, normals = oriented_points(stereo.verified(stereo.depth_maps(views, quiet=quiet)), count, rng)
+        maps = stereo.verified(stereo.depth_maps(views, quiet=quiet))
+        positions, normals = oriented_points(maps, count, rng)
         if len(positions) > _FEW * count:
-            return positions, normals, _colors(positions, views), _spacing(positions)
+            return positions, normals, _colors(positions, views, _seen_in(maps, views)), _spacing(positions)
     if dataset.points is not None and len(dataset.points):
         chosen = np.sort(rng.permutation(len(dataset.points))[:count])
         positions = np.asarray(dataset.points, np.float32)[chosen]
@@ -75,7 +76,20 @@ def _on_hull(views, count, rng, compare, outvoted, quiet) -> Points:
             positions, normals = (np.concatenate([on[~gone], new]) for on, new in zip((positions, normals), below))
     spacing = _spacing(positions)
     depths = hull.depth_maps(*mesh[:2], [view.camera for view in views])
-    return positions, normals, _colors(positions, views, depths, 2 * float(np.median(spacing))), spacing
+    reach = 2 * float(np.median(spacing))
+    seen = lambda index, z, column, row: z < depths[index][row, column] + reach  # NaN: nothing is there
+    return positions, normals, _colors(positions, views, seen), spacing
+
+
+def _seen_in(maps, views):
+    """Which points their ``maps`` have, for `_colors` of the ``views``: no others, before or behind."""
+
+    def seen(index, z, column, row):
+        m, size = maps[index], views[index].camera.size
+        x, y = column * m.camera.size[0] // size[0], row * m.camera.size[1] // size[1]
+        return np.abs(z - m.depth[y, x]) < m.tolerance[y, x]
+
+    return seen
 
 
 def surroundings(dataset: Dataset, count: int, seed: int = 0) -> Points:
@@ -97,11 +111,9 @@ def _spacing(positions: np.ndarray) -> np.ndarray:
     return np.maximum(distance[:, 1:].mean(1), 1e-7).astype(np.float32)
 
 
-def _colors(positions, views, depths=None, tolerance=0.0) -> np.ndarray:
-    """[N, 3] mean linear colour of ``positions`` over the views that see them.
-
-    With ``depths`` (z-depth maps of ``views``) a point more than ``tolerance`` behind them is hidden. Points that no
-    view sees take the mean of all the others, or grey.
+def _colors(positions, views, sees=lambda *_: True) -> np.ndarray:
+    """[N, 3] mean linear colour of ``positions`` over the views that see them: ``sees(index of a view, z-depths, columns, rows)``
+    says which. Points that no view sees take the mean of all the others, or grey.
     """
     total = np.zeros((len(positions), 3), np.float32)
     weight = np.zeros(len(positions), np.float32)
@@ -115,8 +127,7 @@ def _colors(positions, views, depths=None, tolerance=0.0) -> np.ndarray:
             rgb, alpha = _SRGB_TO_LINEAR[rgba[:, :3]], rgba[:, 3] / np.float32(255)
         else:
             rgb, alpha = rgba[:, :3], rgba[:, 3]
-        if depths is not None:
-            alpha = np.where(z[seen] < depths[index][row, column] + tolerance, alpha, 0)  # NaN: nothing is there
+        alpha = np.where(sees(index, z[seen], column, row), alpha, 0)
         total[seen] += rgb * alpha[:, None]
         weight[seen] += alpha
     known = weight > 0

@@ -105,6 +105,7 @@ def measure(
                 seen = found[view.name] = register(registration, surfels, lighting, view, background)
             rendering = evaluate.render_view(surfels, lighting, seen.camera, background, spp, seen.gain)
             pictures.write_view(folder / "test", view, rendering, background, gbuffer=view.name in on_sheet)
+            dr.flush_malloc_cache()  # LPIPS needs as much
             scores[view.name] = evaluate.score(view, rendering, background)
             if registration is not None:
                 scores[view.name][UNALIGNED] = metrics.psnr(unaligned.image, evaluate.ground_truth(view, background))

@@ -89,10 +89,13 @@ def test_the_last_part_is_finer_if_all_views_have_their_turn(dataset):
     fit.step()
     fit._level.seconds.clear()
     fit._level.seconds.append(0.1)
-    fit.elapsed = 60 * (1 - LAST) - 1
-    assert fit.stage.downscale == 2, "too few steps"
     fit.elapsed = 60 * (1 - LAST) + 1
+    assert fit.stage.downscale == 2, "too few steps"
+    fit._level.steps = STEPS[1]
     assert fit.stage.downscale == 1
+    fit.elapsed = 60 * (1 - LAST) - 1
+    assert fit.stage.downscale == 2, "no time for 1000 of them"
+    fit.elapsed = 60 * (1 - LAST) + 1
     fit._level.seconds.clear()
     fit._level.seconds.append(LAST * 60 / (4 * len(dataset.train)))
     assert fit.stage.downscale == 2, "no time for every view"

@@ -8,6 +8,7 @@ import pytest
 from scipy import ndimage
 
 from rgs_mi.core.camera import Camera
+from rgs_mi.core.color import srgb_decode
 from rgs_mi.datasets.types import Dataset, View
 from rgs_mi.priors import hull, stereo
 from rgs_mi.priors.initialization import initial_points
@@ -123,6 +124,17 @@ def test_without_masks_points_lie_on_surfaces_too():
     on_surface = np.any([*walls, abs(z - FLOOR) < 0.04, abs(z - RIM) < 0.04, abs(z + RIM) < 0.04], 0)
     assert on_surface.mean() > 0.9
     assert np.median(normals[on_floor(x, y, z), 2]) > 0.9
+
+
+def test_without_masks_walls_do_not_colour_what_they_hide():
+    bare = [View(v.name, v.camera, v.pixels | np.uint8([0, 0, 0, 255]), False, None, None) for v in textured_tray()]
+    points, _, colors, _ = initial_points(Dataset(bare, []), 3000)
+    floor = on_floor(*points.T)
+    alone = photographs({"floor": tray(0.25)["floor"]})[0]
+    column, row = alone.camera.project(points[floor])[0].astype(int).T
+    truth = srgb_decode(alone.pixels[row, column, 0] / 255)
+    assert floor.sum() > 200 and np.corrcoef(colors[floor, 0], truth)[0, 1] > 0.9
+    assert np.abs(colors[floor, 0] - truth).mean() < 0.2 * truth.std()
 
 
 def test_without_texture_nothing_changes():
