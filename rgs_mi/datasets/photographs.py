@@ -78,7 +78,7 @@ class Photographs:
 
     def tile(self, i: int, turn: int = 0) -> Photograph:
         """Return what a step looks at of view ``i``: its window, or one of the tiles of it, whose ``turn`` it is."""
-        camera, (x, y, *window) = self.views[i].camera, self._windows[i]
+        camera, (x, y, *_), window = self.views[i].camera, self._windows[i], self.window
         if i not in self._images:
             images, prior = self._images_of(i)
             cut = lambda image: image[y : y + window[1], x : x + window[0]].transpose(2, 0, 1)
@@ -88,28 +88,28 @@ class Photographs:
         left, top, width, height = _tile(window, turn)
         flat = lambda planes: [as_float(p.ravel()) for p in planes[:, top : top + height, left : left + width]]
         planes, depth = flat(images), flat(prior)
+        behind = mi.Color3f(*planes[4:] or [self.background])
         return Photograph(
             camera.resized(*size).cropped(x + left, y + top, width, height),
-            mi.Color3f(*planes[:3]),
+            mi.Color3f(*planes[:3]) + behind * (1 - planes[3]),
             planes[3],
-            mi.Color3f(*planes[4:] or [self.background]),
+            behind,
             depth[0] if depth else None,
             bool(self.priors and self.priors[i].inverse),
             size,
-            (window[0], window[1]),
+            window,
         )
 
     def _images_of(self, i):
-        """Of this level: colour, coverage and, where that is no grey level, what lies behind, [H, W, 4 or 7]; and the prior
-        [H, W, 1], or [H, W, 0] where there is none."""
+        """Of this level: colour over black, coverage and, where that is no grey level, what lies behind, [H, W, 4 or 7]; and
+        the prior [H, W, 1], or [H, W, 0] where there is none."""
         view = self.views[i]
-        images = [display(view.pixels, self.background), view.alpha[..., None]]
+        images = [display(view.pixels, 0.0), view.alpha[..., None]]
         if self.tolerance and view.masked:
             opaque = view.pixels.copy()
             opaque[..., 3] = 255 if opaque.dtype == np.uint8 else 1
-            near, shown = _border(view.alpha > 0.5, self.tolerance)[..., None], display(opaque, 0.0)
-            images[0] = np.where(near, shown, images[0])
-            images.append(np.where(near, shown, np.float32(self.background)))
+            near = _border(view.alpha > 0.5, self.tolerance)[..., None]
+            images.append(np.where(near, display(opaque, 0.0), np.float32(self.background)))
         images = shrink(np.concatenate(images, 2), self.downscale)
         if self.priors is None:
             return images, images[..., :0]

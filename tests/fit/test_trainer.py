@@ -64,7 +64,9 @@ def test_priors_are_cropped_like_photographs(dataset, downscale):
 def test_masks_that_may_be_wrong_show_what_lies_behind(dataset):
     """Near their borders the photograph itself; farther away what is opaque, or the background."""
     view = dataset.train[1]
-    view = replace(view, pixels=np.where(view.pixels[..., 3:] > 127, view.pixels, np.uint8([9, 90, 200, 0])))
+    view = replace(
+        view, pixels=np.where(view.pixels[..., 3:] > 127, view.pixels | np.uint8([0, 0, 0, 255]), np.uint8([9, 90, 200, 0]))
+    )
     exact, photo = (Photographs([view], 1, 1.0, tolerance=t).tile(0) for t in (0, 3))
     width, height = photo.camera.size
     image = lambda value: np.array(value).T.reshape(height, width, 3)
