@@ -122,38 +122,51 @@ class _Problem:
         """The sum of squared residuals."""
         return np.square(self.residuals(self.rendered(numbers), numbers)).sum()
 
-    def jacobian(self, picture, numbers):
-        """[3 P, 9], zero in what is not fitted."""
-        columns = np.zeros((self.target.size, len(numbers)))
-        for k in range(len(numbers)):
+    def jacobian(self, numbers):
+        """[3 P, 6] derivatives by the pose, central differences of renderings; zero where it is not fitted."""
+        columns = np.zeros((self.target.size, len(POSE)))
+        for k in range(len(POSE) if self.registration.poses else 0):
             h = np.zeros(len(numbers))
-            if k < len(POSE) and self.registration.poses:
-                h[k] = self.probe
-                ahead, behind = (self.residuals(self.rendered(n), n) for n in (numbers + h, numbers - h))
-                columns[:, k] = (ahead - behind) / (2 * self.probe)
-            elif k >= len(POSE) and self.registration.exposure:
-                h[k] = 1e-3
-                columns[:, k] = (self.residuals(picture, numbers + h) - self.residuals(picture, numbers - h)) / 2e-3
+            h[k] = self.probe
+            ahead, behind = (self.residuals(self.rendered(n), n) for n in (numbers + h, numbers - h))
+            columns[:, k] = (ahead - behind) / (2 * self.probe)
+        return columns
+
+    def by_gains(self, picture, numbers):
+        """[3 P, 3] derivatives by the logarithms of the gains; zero where they are not fitted."""
+        columns = np.zeros((self.target.size, 3))
+        for k in range(3 if self.registration.exposure else 0):
+            h = np.zeros(len(numbers))
+            h[len(POSE) + k] = 1e-3
+            columns[:, k] = (self.residuals(picture, numbers + h) - self.residuals(picture, numbers - h)) / 2e-3
         return columns
 
 
 def _minimized(problem, numbers, steps):
-    """So many ``steps`` of Levenberg and Marquardt's method at most, from ``numbers``."""
+    """So many ``steps`` of Levenberg and Marquardt's method at most, from ``numbers``. Twelve renderings make a Jacobian, so
+    each step corrects that of the one before by what it has seen (Broyden 1965), and only where one leads nowhere is it
+    taken anew."""
     damping, picture = _DAMPING, problem.rendered(numbers)
-    residuals = problem.residuals(picture, numbers)
+    residuals, jacobian, fresh = problem.residuals(picture, numbers), problem.jacobian(numbers), True
     for _ in range(steps):
-        jacobian = problem.jacobian(picture, numbers)
-        normal, right = jacobian.T @ jacobian, jacobian.T @ residuals
-        for _ in range(4):
+        both = np.hstack([jacobian, problem.by_gains(picture, numbers)])
+        normal, right = both.T @ both, both.T @ residuals
+        for _ in range(4 if fresh else 1):
             step = -np.linalg.solve(normal + np.diag(damping * np.diag(normal) + 1e-9), right)
             ahead = problem.rendered(numbers + step)
             lower = problem.residuals(ahead, numbers + step)
-            if lower @ lower < residuals @ residuals:
+            if better := lower @ lower < residuals @ residuals:
                 break
             damping *= 10
-        else:
-            return numbers
-        numbers, picture, residuals, damping = numbers + step, ahead, lower, damping / 10
+        if not better:
+            if fresh:
+                return numbers
+            jacobian, fresh, damping = problem.jacobian(numbers), True, _DAMPING
+            continue
+        pose = step[: len(POSE)]
+        if moved := pose @ pose:
+            jacobian += np.outer(lower - residuals - both @ step, pose / moved)
+        numbers, picture, residuals, damping, fresh = numbers + step, ahead, lower, damping / 10, False
         if np.abs(step).max() < _STILL * problem.probe / _PROBE:
             return numbers
     return numbers

@@ -96,8 +96,39 @@ def mask(alpha: "mi.Float", target: "mi.Float") -> "mi.Float":
     return dr.mean(dr.abs(alpha - target))
 
 
+class _Shifted(dr.CustomOp):
+    """A list of images as others see them, each pixel what ``offset`` pixels further has; zero beyond the ends. Its adjoint is
+    a gather, too, where that of a plain gather would add atomically."""
+
+    def eval(self, channels, offset):
+        self.offset = offset
+        return self._apply(channels, offset)
+
+    def forward(self):
+        self.set_grad_out(self._apply(self.grad_in("channels"), self.offset))
+
+    def backward(self):
+        self.set_grad_in("channels", self._apply(self.grad_out(), -self.offset))
+
+    def _apply(self, channels, offset):
+        dr.eval(channels)
+        count = dr.width(channels)
+        at = dr.arange(mi.Int32, count) + offset
+        inside = (at >= 0) & (at < count)
+        return [dr.gather(mi.Float, c, mi.UInt32(at), inside) for c in channels]
+
+    def name(self):
+        return "rgs_mi.fit.losses.Shifted"
+
+
+def _neighbors(image, size):
+    """What the pixels to the left, to the right, above and below have of an ``image`` (a list of channels)."""
+    kind = type(image)
+    return [kind(*dr.custom(_Shifted, list(image), offset)) for offset in (-1, 1, -size[0], size[0])]
+
+
 def _interior(gbuffer):
-    """Indices of the pixels that are covered together with their four neighbours."""
+    """Which pixels are covered together with their four neighbours."""
     width, height = gbuffer.size
     with dr.suspend_grad():
         alpha = gbuffer.all.alpha
@@ -107,24 +138,20 @@ def _interior(gbuffer):
         inner = (x > 0) & (y > 0) & (x + 1 < width) & (y + 1 < height)
         for neighbour in (index, index - 1, index + 1, index - width, index + width):
             inner &= dr.gather(mi.Float, alpha, neighbour, inner) > 0.5
-        return dr.compress(inner)
+        dr.eval(inner)
+        return inner
 
 
 def depth_normal_consistency(gbuffer: GBuffer, camera: Camera) -> "mi.Float":
     """Return the depth-normal consistency (2DGS): the mean of 1 − n·n_D over the image, with n the rendered normal and n_D
     that of the surface which the rendered (expected) depth describes, by central differences."""
-    width, height = gbuffer.size
-    index = _interior(gbuffer)
-    if dr.width(index) == 0:
-        return mi.Float(0)
-
-    def point(i):
-        m = gbuffer.maps(i)
-        return pixel_rays(camera, i) * (m.depth / m.alpha)  # relative to the camera, world space
-
-    n_depth = dr.normalize(dr.cross(point(index + width) - point(index - width), point(index + 1) - point(index - 1)))
-    n = dr.normalize(gbuffer.maps(index).normal)
-    return dr.sum(1 - dr.dot(n, n_depth)) / (width * height)
+    (width, height), m, inner = gbuffer.size, gbuffer.all, _interior(gbuffer)
+    rays = pixel_rays(camera, dr.arange(mi.UInt32, width * height))
+    point = rays * (m.depth / dr.select(m.alpha > 0.5, m.alpha, 1))  # relative to the camera, world space
+    left, right, above, below = _neighbors(point, gbuffer.size)
+    unit = lambda v: dr.normalize(dr.select(inner, v, mi.Vector3f(0, 0, 1)))
+    n, n_depth = unit(m.normal), unit(dr.cross(below - above, right - left))
+    return dr.sum(dr.select(inner, 1 - dr.dot(n, n_depth), 0)) / (width * height)
 
 
 def distortion(maps: Maps, extent: float) -> "mi.Float":
@@ -138,16 +165,12 @@ def normal_smoothness(gbuffer: GBuffer, reflective: np.ndarray, crease: float = 
     """Return RGS's L_normal: the mean squared forward difference of N from pixel to pixel, where both are ``reflective``
     (β̂, [H, W] bool). With ``crease``, d² counts as d² / (1 + d²/crease²): noise of a few degrees is smoothed, an edge of
     the object is let be."""
-    width, height = gbuffer.size
-    index = _interior(gbuffer)
-    if dr.width(index) == 0:
-        return mi.Float(0)
-    total, pairs, here = mi.Float(0), mi.Float(0), gbuffer.maps(index).normal
-    mask = as_float(reflective)
-    inside = lambda i: dr.gather(mi.Float, mask, i) > 0
-    for step in (1, width):
-        d2 = dr.squared_norm(gbuffer.maps(index + step).normal - here)
-        counted = inside(index) & inside(index + step)
+    inner, here = _interior(gbuffer), gbuffer.all.normal
+    total, pairs = mi.Float(0), mi.Float(0)
+    _, right, _, below = _neighbors(here, gbuffer.size)
+    for axis, beside in ((1, right), (0, below)):
+        counted = inner & (as_float(reflective & np.roll(reflective, -1, axis)) > 0)  # what is rolled in is not interior
+        d2 = dr.squared_norm(beside - here)
         total += dr.sum(dr.select(counted, d2 / (1 + d2 / crease**2) if crease > 0 else d2, 0))
         pairs += mi.Float(dr.count(counted))
     return 2 * total / dr.maximum(pairs, 1)

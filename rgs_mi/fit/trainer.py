@@ -14,6 +14,7 @@ from ..datasets.types import Dataset, DepthPrior
 from ..settings.settings import Settings, Stage
 from ..shading import deferred
 from ..shading.lighting import Lighting, Shading, lighting_of
+from ..splat.tiles import Cutoffs
 from ..surfels.proxies import Proxies
 from ..surfels.surfels import CHANNELS, Surfels
 from . import losses, reflection_guided
@@ -27,6 +28,7 @@ from .schedule import Schedule
 
 _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
 _PACE = 31  # steps whose median says how long one takes
+_CUTOFFS = Cutoffs(transmittance_min=1e-2)  # of a step: what shines through the last hundredth costs half of all hits
 _DIVERGED = 10  # steps in a row without a finite error
 
 
@@ -124,7 +126,7 @@ class Fit:
         planned, now, s = self.schedule.stage(self.progress), self._level, self.settings
         if now is None or s.iterations or s.minutes is None or planned.downscale >= now.stage.downscale:
             return planned
-        if self.photographs is None:
+        if self.photographs is None or not now.seconds:
             return now.stage
         finer = max((stage for stage in s.stages or () if stage.downscale < now.stage.downscale), key=lambda x: x.downscale)
         scale = now.stage.downscale / finer.downscale
@@ -264,7 +266,7 @@ class Fit:
             photo, gain, terms = replace(photo, camera=seen.camera), seen.gain, {"loss.cameras": seen.prior}
         means2d_offset = dr.zeros(mi.Vector2f, len(self.model))
         dr.enable_grad(means2d_offset)
-        image = deferred.render(surfels, photo.camera, lighting, means2d_offset, full=self.objective.full)
+        image = deferred.render(surfels, photo.camera, lighting, means2d_offset, _CUTOFFS, self.objective.full)
         consistency = self.schedule.value(self.settings.weights.consistency, self.progress)
         loss = self.objective(image, photo, self.dataset.train[i].masked, consistency, self.step_number, gain)
         terms |= loss.terms

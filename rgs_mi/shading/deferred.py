@@ -8,6 +8,7 @@ import mitsuba as mi
 from ..core.bounding_box import BoundingBox
 from ..core.camera import Camera, opaque, pixel_directions
 from ..splat.gbuffer import GBuffer, render_gbuffer
+from ..splat.tiles import Cutoffs
 from ..surfels.surfels import Surfels
 from .lighting import Lighting
 from .surface import Surface
@@ -76,10 +77,11 @@ def render(
     camera: Camera,
     lighting: Lighting | None,
     means2d_offset: "mi.Vector2f | None" = None,
+    cutoffs: Cutoffs = Cutoffs(),
     full: bool = False,
 ) -> Image:
     """Splat ``surfels`` (see `render_gbuffer`, also for the other arguments) and `shade` them; differentiable in their
     fields, the environment and the shader."""
     if lighting is not None:
         surfels = lighting.as_splatted(surfels)
-    return shade(render_gbuffer(surfels, camera, means2d_offset, full=full), camera, lighting)
+    return shade(render_gbuffer(surfels, camera, means2d_offset, cutoffs, full), camera, lighting)

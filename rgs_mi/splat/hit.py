@@ -75,18 +75,22 @@ class Hit:
         self.alpha = dr.select(self.kept, dr.minimum(alpha, cutoffs.alpha_max), 0)
         self.t = dr.select(self.on_plane, z * self.inv_h, z)
 
-    def sort_key(self, gaussian: "Sequence[mi.Float]", cutoffs: Cutoffs) -> "mi.Float":
-        """Return the depth t, if this hit is in the middle of a block's pixels, and −∞ where none of them can see the
-        surfel: where α is at the cut-off or below at each, with u and v taken times h to spare the divisions."""
+    def in_block(self, gaussian: "Sequence[mi.Float]", cutoffs: Cutoffs) -> "tuple[mi.Float, mi.Bool, list[mi.Float]]":
+        """Return what this hit, in the middle of a block's pixels, says of these: the depth t; whether any of them can see the
+        surfel, α being above the cut-off; and at least how much of the light behind it hides from each of them. u and v are
+        taken times h to spare the divisions, and exp(−ρ/2) is at least (1 − ρ/8)⁴."""
         _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, opacity = gaussian[: len(GEOMETRY)]
         limit = 2 * dr.log(opacity / cutoffs.alpha_min) + _SLACK
-        seen = mi.Bool(False)
+        most, seen, alphas = dr.minimum(opacity, cutoffs.alpha_max), mi.Bool(False), []
+        eighth = self.inv_h * self.inv_h / 8
         for x, y in itertools.product(*((k - 0.5 * (n - 1) for k in range(n)) for n in BLOCK)):
             dx, dy = self.dx + x, self.dy + y
             h, u, v = (offset + a * dx + b * dy for offset, a, b in ((1, N_x, N_y), (0, A_x, A_y), (0, B_x, B_y)))
-            seen |= (h > HORIZON) & (u * u + v * v < limit * h * h)
-            seen |= LOW_PASS * (dx * dx + dy * dy) < limit
-        return dr.select(seen, self.t, -dr.inf)
+            rho = u * u + v * v
+            near = (h > HORIZON) & (rho < limit * h * h)
+            seen |= near | (LOW_PASS * (dx * dx + dy * dy) < limit)
+            alphas.append(dr.select(near, most * dr.square(dr.square(dr.maximum(1 - eighth * rho, 0))), 0))
+        return self.t, seen, alphas
 
     def vjp(
         self, gaussian: "Sequence[mi.Float]", d_alpha: "mi.Float", d_t: "mi.Float", d_offset: "Sequence[mi.Float]"

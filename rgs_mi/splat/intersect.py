@@ -1,6 +1,6 @@
 """Tile intersections: which surfels each block of 2 × 2 pixels sees, front to back.
 
-First by tile: bounds, then two stable radix sorts, by depth at the tile's centre and by tile. On a smooth surface, where
+First by tile: bounds, then a radix sort by tile and by depth at the tile's centre. On a smooth surface, where
 surfels lie almost on one another, that is not their order elsewhere in the tile: reflections would jump from tile to tile,
 and with the view. So every block takes from its tile's list the surfels that its own 2 × 2 pixels can see, and brings them
 into the order in which these pixels meet them, through a queue of ``resort_window`` surfels (StopThePop, Radl et al. 2024).
@@ -10,6 +10,7 @@ The bounds are exact. A surfel's weight exceeds the cut-off where u² + v² ≤ 
 both, so no tile is listed that the surfel cannot reach, whatever its shape, tilt or opacity.
 """
 
+import functools
 from dataclasses import dataclass
 
 import drjit as dr
@@ -21,6 +22,7 @@ from .tiles import BLOCK, LOW_PASS, TILE, Cutoffs, block_pixels, tile_grid
 
 FAR = 1e6  # pixels: beyond every image
 SORT_RADIUS = 3.0  # standard deviations
+_HIDDEN = 0.1  # of the least transmittance: where a list ends, for what its block's own order brings forward
 
 
 @dataclass
@@ -113,40 +115,74 @@ def isect_tiles(projected: Projected, size: tuple[int, int], cutoffs: Cutoffs) -
     them; blocks are in the order of `block_pixels`. Not differentiated."""
     with dr.suspend_grad():
         tiles = _tile_intersections(projected, size, cutoffs.alpha_min)
-        tile, pixels = block_pixels(size)
-        first, count = (dr.gather(mi.UInt32, values, tile) for values in (tiles.first, tiles.count))
-        end, stop = first + count, first + dr.select(count > 0, count + cutoffs.resort_window, 0)
-        blocks = dr.width(tile) // dr.width(tiles.first)
-        start = first * blocks + count * (dr.arange(mi.UInt32, dr.width(tile)) % blocks)  # room for the whole tile's list
-        x, y = (mi.Float(corner) + 0.5 * n for corner, n in zip(pixels[0], BLOCK))
-        gaussians = pack(projected.geometry)
-        ids = dr.empty(mi.UInt32, dr.width(tiles.ids) * blocks)
-        dr.eval(gaussians, first, end, stop, start, x, y)
+        return _sorted(*_seen_by_blocks(projected, size, tiles, cutoffs), cutoffs)
 
-        def queued(depth, surfel, at, depths, surfels):
-            for k in reversed(range(cutoffs.resort_window)):
-                nearer = depth < depths[k]
-                depth, depths[k] = dr.minimum(depth, depths[k]), dr.maximum(depth, depths[k])
-                surfel, surfels[k] = dr.select(nearer, surfel, surfels[k]), dr.select(nearer, surfels[k], surfel)
-            leaves = depth > -dr.inf
-            dr.scatter(ids, surfel, at, leaves)
-            return depth, surfel, at + dr.select(leaves, mi.UInt32(1), 0), depths, surfels
 
-        def step(i, at, depths, surfels):
-            listed = i < end
-            surfel = dr.gather(mi.UInt32, tiles.ids, i, listed)
-            gaussian = fetch(gaussians, surfel, padded(len(projected.geometry)), listed)
-            # One surfel enters the queue, the nearest leaves it; "farther than all" drives the rest out in the end.
-            depth = dr.select(listed, Hit(gaussian, x, y, cutoffs).sort_key(gaussian, cutoffs), dr.inf)
-            state = depth, surfel, at, depths, surfels
-            _, _, at, depths, surfels = dr.if_stmt(state, depth > -dr.inf, queued, lambda *state: state)
-            return i + 1, at, depths, surfels
+def _seen_by_blocks(projected, size, tiles, cutoffs):
+    """(`TileIntersections` of blocks, in the order of their tiles; the depths at which their middles meet these surfels). Lists
+    end where nothing behind can be seen any more, or a little later."""
+    tile, pixels = block_pixels(size)
+    first, count = (dr.gather(mi.UInt32, values, tile) for values in (tiles.first, tiles.count))
+    end, blocks = first + count, dr.width(tile) // dr.width(tiles.first)
+    start = first * blocks + count * (dr.arange(mi.UInt32, dr.width(tile)) % blocks)  # room for the whole tile's list
+    x, y = (mi.Float(corner) + 0.5 * n for corner, n in zip(pixels[0], BLOCK))
+    gaussians = pack(projected.geometry)
+    ids, depths = (dr.empty(kind, dr.width(tiles.ids) * blocks) for kind in (mi.UInt32, mi.Float))
+    dr.eval(gaussians, first, end, start, x, y)
 
-        empty = [mi.Float(-dr.inf)] * cutoffs.resort_window, [mi.UInt32(0)] * cutoffs.resort_window
-        past = dr.while_loop((first, start, *empty), lambda i, at, depths, surfels: i < stop, step, label="sort")[1]
-        count = past - start
-        dr.eval(ids, count)
-        return TileIntersections(ids, start, count, tiles.seen)
+    def step(i, at, T):
+        surfel = dr.gather(mi.UInt32, tiles.ids, i)
+        gaussian = fetch(gaussians, surfel, padded(len(projected.geometry)))
+        depth, seen, alphas = Hit(gaussian, x, y, cutoffs).in_block(gaussian, cutoffs)
+        dr.scatter(ids, surfel, at, seen)
+        dr.scatter(depths, depth, at, seen)
+        return i + 1, at + dr.select(seen, mi.UInt32(1), 0), [t - t * alpha for t, alpha in zip(T, alphas)]
+
+    def alive(i, at, T):
+        return (i < end) & (functools.reduce(dr.maximum, T) > _HIDDEN * cutoffs.transmittance_min)
+
+    past = dr.while_loop((first, start, [mi.Float(1) for _ in pixels]), alive, step, label="list")[1]
+    count = past - start
+    dr.eval(ids, depths, count)
+    return TileIntersections(ids, start, count, tiles.seen), depths
+
+
+def _sorted(lists, keys, cutoffs) -> TileIntersections:
+    """The ``lists`` of blocks in the order of their ``keys``, but for surfels that are farther than a queue from their place."""
+    first = dr.prefix_reduce(dr.ReduceOp.Add, lists.count, exclusive=True)
+    total = int(first[-1] + lists.count[-1])
+    if total == 0:
+        return lists
+    ids, length = dr.empty(mi.UInt32, total), cutoffs.resort_window
+    stop = dr.select(lists.count > 0, lists.count + length, 0)
+
+    def step(i, depths, surfels):
+        # One surfel enters the queue, the nearest leaves it; "farther than all" drives the rest out in the end.
+        listed = i < lists.count
+        surfel = dr.gather(mi.UInt32, lists.ids, lists.first + i, listed)
+        depth = dr.select(listed, dr.gather(mi.Float, keys, lists.first + i, listed), dr.inf)
+        for k in reversed(range(length)):
+            nearer = depth < depths[k]
+            depth, depths[k] = dr.minimum(depth, depths[k]), dr.maximum(depth, depths[k])
+            surfel, surfels[k] = dr.select(nearer, surfel, surfels[k]), dr.select(nearer, surfels[k], surfel)
+        dr.scatter(ids, surfel, first + i - length, i >= length)
+        return i + 1, depths, surfels
+
+    state = mi.UInt32(0), [mi.Float(-dr.inf)] * length, [mi.UInt32(0)] * length
+    dr.eval(dr.while_loop(state, lambda i, depths, surfels: i < stop, step, label="sort"))
+    dr.eval(ids)
+    return TileIntersections(ids, first, lists.count, lists.seen)
+
+
+def _sort_key(tile, depth, tiles):
+    """One number of 32 bits to sort by: the ``tile``, of so many ``tiles``, then the ``depth``, as finely as there are bits left.
+    Between the nearest and the farthest positive floats are in the order of their bits, which are steps of some part of
+    themselves: of 1e-4 and less, as a rule, which the blocks' own order mends."""
+    bits = dr.reinterpret_array(mi.UInt32, dr.fmax(depth, 0))
+    least, most = (int(reduced(bits)[0]) for reduced in (dr.min, dr.max))
+    room = 32 - max(tiles - 1, 1).bit_length()
+    drop = max((most - least).bit_length() - room, 0)
+    return (tile << room) | ((bits - dr.opaque(mi.UInt32, least)) >> dr.opaque(mi.UInt32, drop))
 
 
 def _tile_intersections(projected, size, alpha_min) -> TileIntersections:
@@ -201,8 +237,6 @@ def _tile_intersections(projected, size, alpha_min) -> TileIntersections:
     length = dr.zeros(mi.UInt32, n_tiles)
     dr.scatter_reduce(dr.ReduceOp.Add, length, mi.UInt32(1), tile)
     first = dr.prefix_reduce(dr.ReduceOp.Add, length, exclusive=True)
-    near = dr.argsort(depth)
-    order = dr.gather(mi.UInt32, near, dr.argsort(dr.gather(mi.UInt32, tile, near)))  # stable: by tile, then by depth
-    ids = dr.gather(mi.UInt32, surfel, order)
+    ids = dr.gather(mi.UInt32, surfel, dr.argsort(_sort_key(tile, depth, n_tiles)))
     dr.eval(ids, first, length, seen)
     return TileIntersections(ids, first, length, seen)

@@ -7,10 +7,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from rgs_mi.splat import gbuffer
+from rgs_mi.splat import gbuffer, intersect
+from rgs_mi.splat.project import project
 from rgs_mi.splat.reference import render_gbuffer_reference
 from rgs_mi.splat.tiles import Cutoffs
-from rgs_mi.surfels.surfels import CHANNELS, Surfels
+from rgs_mi.surfels.surfels import CHANNELS, Surfels, rotation_from_normal
 
 from scenes import layered_surfels, orbit_camera, sphere_surfels, tangent_surfels
 
@@ -93,6 +94,38 @@ def test_window_brings_tiles_into_order():
 
     seams = {window: np.square(image(0, window) - image(4, window)).mean() for window in (1, 16)}
     assert 0 < seams[16] < 0.1 * seams[1], seams
+
+
+@pytest.mark.parametrize("least", [1e-4, 1e-2])
+def test_lists_end_behind_what_hides(least):
+    """Of many surfels one behind the other lists hold the first, and what they leave out no pixel would have seen."""
+    camera, rng = orbit_camera(size=(32, 24)), np.random.default_rng(0)
+    right, down, forward = camera.rotation
+    surfels = sphere_surfels(240, scale=1.6, opacity_shift=3).numpy()
+    across, layer = rng.uniform(-1.2, 1.2, (240, 2)), np.linspace(-1, 1, 240)[:, None]
+    surfels["centers"] = across[:, :1] * right + across[:, 1:] * down + layer * forward
+    surfels["rotations"] = rotation_from_normal(np.tile(-forward, (240, 1)), rng.uniform(0, 6, 240))
+    surfels, cutoffs = Surfels.from_numpy(surfels), Cutoffs(transmittance_min=least, resort_window=96)
+    mine, reference = (stacked(f(surfels, camera, cutoffs)) for f in (render_gbuffer, render_gbuffer_reference))
+    # A pixel goes on while another of its block does: that far at most
+    assert (np.abs(mine - reference) < least * 1.5 * np.abs(reference).max(1, keepdims=True) + 1e-4).all()
+    with dr.suspend_grad():
+        listed = lambda least: dr.sum(
+            intersect.isect_tiles(project(surfels, camera), camera.size, replace(cutoffs, transmittance_min=least)).count
+        )[0]
+        assert 0 < listed(least) < 0.8 * listed(0)
+
+
+def test_tiles_come_before_depths():
+    """One number sorts by both, however near or far, and nothing that is not a number spoils it."""
+    rng = np.random.default_rng(0)
+    tile, depth = rng.integers(0, 3000, 20_000).astype(np.uint32), np.exp(rng.uniform(-4, 6, 20_000)).astype(np.float32)
+    depth[5] = np.nan
+    order = dr.argsort(intersect._sort_key(mi.UInt32(tile), mi.Float(depth), 3000)).numpy()
+    assert (np.diff(tile[order].astype(int)) >= 0).all()
+    ahead, behind = depth[order][:-1], depth[order][1:]
+    same = (np.diff(tile[order].astype(int)) == 0) & np.isfinite(ahead) & np.isfinite(behind)
+    assert (behind >= ahead * (1 - 1e-3))[same].all()
 
 
 def test_curved_surfels_have_the_normals_of_a_sphere():
