@@ -129,9 +129,8 @@ def _neighbors(image, size):
 
 def _interior(gbuffer):
     """Which pixels are covered together with their four neighbours."""
-    width, height = gbuffer.size
+    (width, height), alpha = gbuffer.size, dr.detach(gbuffer.all.alpha)
     with dr.suspend_grad():
-        alpha = gbuffer.all.alpha
         dr.eval(alpha)  # a gather from a packet that is not evaluated yet crashes (Dr.Jit 1.5.0)
         index = dr.arange(mi.UInt32, width * height)
         x, y = index % width, index // width
