@@ -10,12 +10,14 @@ import argparse
 import math
 from pathlib import Path
 
+import rgs_mi  # before mitsuba, so that it can choose a working LLVM
+
+# isort: split
 import mitsuba as mi
 import numpy as np
 from PIL import Image
 from scipy import ndimage
 
-import rgs_mi
 from rgs_mi.core.camera import Camera
 from rgs_mi.core.color import srgb_encode, to_8bit
 from rgs_mi.core.files import write_json
@@ -24,8 +26,8 @@ from rgs_mi.core.scene_files import load_scene
 from rgs_mi.datasets.path_traced import _CV_TO_BLENDER, FOV, Renderer, bounds
 
 HELMET = Path(__file__).parents[1] / "scenes" / "targets" / "helmet.xml"
-TRAIN, TEST, SIZE, SPP = 60, 8, 400, 144  # test views take twice the samples
-SIDE, HEIGHT = 4.0, 3.2  # of the room: half its width, and its height, in radii of the object
+TRAIN, TEST, SIZE, SPP = 60, 8, 400, 64  # test views take twice the samples
+SIDE, HEIGHT = 4.4, 5.0  # of the room: half its width, and its height, in radii of the object
 DISTANCE = 1.25  # of the cameras, over that at which the object fills the frame
 ELEVATIONS = 8, 62  # degrees
 EXPOSURE = 0.9
@@ -97,6 +99,8 @@ def render(out):
     )
     alone = mi.load_dict({"type": "scene", **shapes})
     distance = DISTANCE * radius / math.sin(math.radians(FOV / 2))
+    highest = center[2] - floor + distance * math.sin(math.radians(ELEVATIONS[1]))
+    assert distance < 0.95 * SIDE * radius and highest < 0.95 * HEIGHT * radius, "cameras stand within the room"
     renderer, silhouettes = Renderer(scene, SIZE), Renderer(alone, SIZE)
     with Progress(label="rendering the room") as progress:
         for split, count, seed in (("train", TRAIN, 0), ("test", TEST, 1)):

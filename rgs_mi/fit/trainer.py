@@ -28,7 +28,7 @@ from .schedule import Schedule
 
 _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
 _PACE = 31  # steps whose median says how long one takes
-_CUTOFFS = Cutoffs(transmittance_min=1e-2)  # of a step: what shines through the last hundredth costs half of all hits
+_CUTOFFS = Cutoffs(transmittance_min=1e-2)  # of a step: what the last hundredth of the light shows costs a third of all hits
 _DIVERGED = 10  # steps in a row without a finite error
 
 

@@ -1,9 +1,10 @@
 """Tile intersections: which surfels each block of 2 × 2 pixels sees, front to back.
 
-First by tile: bounds, then a radix sort by tile and by depth at the tile's centre. On a smooth surface, where
-surfels lie almost on one another, that is not their order elsewhere in the tile: reflections would jump from tile to tile,
-and with the view. So every block takes from its tile's list the surfels that its own 2 × 2 pixels can see, and brings them
-into the order in which these pixels meet them, through a queue of ``resort_window`` surfels (StopThePop, Radl et al. 2024).
+First by tile: bounds, then a radix sort by tile and by depth at the tile's centre. On a smooth surface, where surfels lie
+almost on one another, that is not their order elsewhere in the tile: reflections would jump from tile to tile, and with the
+view. So every block takes from its tile's list the surfels that its own 2 × 2 pixels can see, until these hide what is
+behind, and brings them into the order in which these pixels meet them, through a queue of ``resort_window`` surfels
+(StopThePop, Radl et al. 2024).
 
 The bounds are exact. A surfel's weight exceeds the cut-off where u² + v² ≤ r² with r² = 2 ln(opacity / cut-off), which by
 (1) of `project.py` is an ellipse on the screen, or inside the disk of the low-pass. Each row of tiles is intersected with
