@@ -1,9 +1,9 @@
 """A shiny object in a room that photographs show, without masks and points: what phones make of it.
 
-``python tests/room.py DATA`` path-traces the helmet in a closed room, with textures on its walls, into a data set in the
-Blender layout whose images have no alpha; masks of the object lie beside the held-out ones. ``rgs-mi optimize object --data
-DATA --out RUN --minutes 10`` fits it, and ``python tests/room.py DATA --score RUN`` prints how good RUN is within the
-object's silhouette.
+``python tests/room.py DATA`` path-traces the helmet in a closed room, with textures on its walls, into a capture in
+nerfstudio's layout, which fits take for photographs, without masks; silhouettes in the held-out ones lie beside them.
+``rgs-mi optimize object --data DATA --out RUN --minutes 10`` fits it, and ``python tests/room.py DATA --score RUN`` prints
+how good RUN is within the object's silhouette.
 """
 
 import argparse
@@ -26,7 +26,7 @@ from rgs_mi.core.scene_files import load_scene
 from rgs_mi.datasets.path_traced import _CV_TO_BLENDER, FOV, Renderer, bounds
 
 HELMET = Path(__file__).parents[1] / "scenes" / "targets" / "helmet.xml"
-TRAIN, TEST, SIZE, SPP = 60, 8, 400, 64  # test views take twice the samples
+COUNTS, SIZE, SPP = {"train": 60, "test": 8}, 400, 64  # test views take twice the samples
 SIDE, HEIGHT = 4.4, 5.0  # of the room: half its width, and its height, in radii of the object
 DISTANCE = 1.25  # of the cameras, over that at which the object fills the frame
 ELEVATIONS = 8, 62  # degrees
@@ -80,11 +80,11 @@ def room(center, radius, floor):
     }
 
 
-def directions(count, seed):
+def directions(count, split):
     """Unit directions [count, 3] from the object, spread over the elevations that people hold cameras at."""
     low, high = np.sin(np.radians(ELEVATIONS))
     z = low + (high - low) * (np.arange(count) + 0.5) / count
-    azimuth = math.pi * (3 - math.sqrt(5)) * np.arange(count) + seed
+    azimuth = math.pi * (3 - math.sqrt(5)) * np.arange(count) + (split == "test")
     return np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], -1)
 
 
@@ -102,33 +102,36 @@ def render(out):
     highest = center[2] - floor + distance * math.sin(math.radians(ELEVATIONS[1]))
     assert distance < 0.95 * SIDE * radius and highest < 0.95 * HEIGHT * radius, "cameras stand within the room"
     renderer, silhouettes = Renderer(scene, SIZE), Renderer(alone, SIZE)
+    focal = SIZE / 2 / math.tan(math.radians(FOV / 2))
+    frames, views = [], [(split, i, d) for split, count in COUNTS.items() for i, d in enumerate(directions(count, split))]
+    for folder in ("images", "silhouettes"):
+        (out / folder).mkdir(parents=True, exist_ok=True)
     with Progress(label="rendering the room") as progress:
-        for split, count, seed in (("train", TRAIN, 0), ("test", TEST, 1)):
-            (out / split).mkdir(parents=True, exist_ok=True)
-            frames = []
-            for i, direction in enumerate(directions(count, seed)):
-                camera = Camera.look_at(center + distance * direction, center, (0, 0, 1), FOV, (SIZE, SIZE))
-                frames.append(
-                    {"file_path": f"./{split}/r_{i}", "transform_matrix": (camera.to_world @ _CV_TO_BLENDER).tolist()}
-                )
-                path = out / split / f"r_{i}.png"
-                if not path.is_file():
-                    linear = renderer.radiance(camera, SPP * (2 if split == "test" else 1), 1000 * seed + i)[..., :3]
-                    if split == "test":
-                        mask = silhouettes.aov(camera)[..., -1]
-                        Image.fromarray(to_8bit(mask)).save(out / split / f"mask_{i}.png")
-                    Image.fromarray(to_8bit(srgb_encode(np.clip(EXPOSURE * linear, 0, 1)))).save(path)
-                progress.update((len(frames) + seed * TRAIN) / (TRAIN + TEST), views=len(frames))
-            write_json(out / f"transforms_{split}.json", {"camera_angle_x": math.radians(FOV), "frames": frames})
+        for split, i, direction in views:
+            camera = Camera.look_at(center + distance * direction, center, (0, 0, 1), FOV, (SIZE, SIZE))
+            path = out / "images" / f"{split}_{i}.png"
+            frames.append(
+                {"file_path": f"images/{path.name}", "transform_matrix": (camera.to_world @ _CV_TO_BLENDER).tolist()}
+            )
+            if not path.is_file():
+                test = split == "test"
+                linear = renderer.radiance(camera, SPP * (2 if test else 1), 1000 * test + i)[..., :3]
+                if test:
+                    Image.fromarray(to_8bit(silhouettes.aov(camera)[..., -1])).save(out / "silhouettes" / path.name)
+                Image.fromarray(to_8bit(srgb_encode(np.clip(EXPOSURE * linear, 0, 1)))).save(path)
+            progress.update(len(frames) / len(views), views=len(frames))
+    names = {f"{split}_filenames": [f["file_path"] for f in frames if f"/{split}_" in f["file_path"]] for split in COUNTS}
+    lens = {"fl_x": focal, "fl_y": focal, "cx": SIZE / 2, "cy": SIZE / 2, "w": SIZE, "h": SIZE}
+    write_json(out / "transforms.json", {"camera_model": "PINHOLE", **lens, "frames": frames, **names})
 
 
 def score(data, run):
     """Print the mean PSNR of the held-out views of ``run`` within the object's silhouette, and of whole pictures."""
     inside, whole = [], []
-    for i in range(TEST):
-        read = lambda path: np.asarray(Image.open(path).convert("RGB"), np.float64) / 255
-        square = ((read(data / "test" / f"r_{i}.png") - read(run / "test" / f"r_{i}.png")) ** 2).mean(-1)
-        mask = np.asarray(Image.open(data / "test" / f"mask_{i}.png")) > 127
+    for i in range(COUNTS["test"]):
+        name, read = f"test_{i}.png", lambda path: np.asarray(Image.open(path).convert("RGB"), np.float64) / 255
+        square = ((read(data / "images" / name) - read(run / "test" / name)) ** 2).mean(-1)
+        mask = np.asarray(Image.open(data / "silhouettes" / name)) > 127
         inside.append(-10 * np.log10(square[mask].mean()))
         whole.append(-10 * np.log10(square.mean()))
     print(
