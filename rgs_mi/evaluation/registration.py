@@ -21,7 +21,7 @@ from ..shading.lighting import Lighting
 from ..surfels.surfels import Surfels
 
 #: Pixels of a photograph's side that make one of a level's: steps of Levenberg and Marquardt, at most.
-_LEVELS = {4: 6, 2: 6, 1: 6}
+_LEVELS = {4: 20, 2: 20, 1: 20}
 _LEAST, _MOST = 24, 500  # pixels of a level's height, and of its longer side: more tell a pose hardly better
 _PROBE = 0.5  # pixels that differences of poses move a picture by
 _STILL = 0.02  # pixels: a step that moves a picture by less is the last
@@ -144,8 +144,8 @@ class _Problem:
 
 def _minimized(problem, numbers, steps):
     """So many ``steps`` of Levenberg and Marquardt's method at most, from ``numbers``. Twelve renderings make a Jacobian, so
-    each step corrects that of the one before by what it has seen (Broyden 1965), and only where one leads nowhere is it
-    taken anew."""
+    each step corrects that of the one before by what it has seen (Broyden 1965). Only where one leads nowhere, or hardly
+    anywhere, is it taken anew, to see whether that is the end."""
     damping, picture = _DAMPING, problem.rendered(numbers)
     residuals, jacobian, fresh = problem.residuals(picture, numbers), problem.jacobian(numbers), True
     for _ in range(steps):
@@ -158,15 +158,14 @@ def _minimized(problem, numbers, steps):
             if better := lower @ lower < residuals @ residuals:
                 break
             damping *= 10
-        if not better:
-            if fresh:
-                return numbers
-            jacobian, fresh, damping = problem.jacobian(numbers), True, _DAMPING
-            continue
-        pose = step[: len(POSE)]
-        if moved := pose @ pose:
-            jacobian += np.outer(lower - residuals - both @ step, pose / moved)
-        numbers, picture, residuals, damping, fresh = numbers + step, ahead, lower, damping / 10, False
-        if np.abs(step).max() < _STILL * problem.probe / _PROBE:
+        still = not better or np.abs(step).max() < _STILL * problem.probe / _PROBE
+        if better:
+            pose = step[: len(POSE)]
+            if moved := pose @ pose:
+                jacobian += np.outer(lower - residuals - both @ step, pose / moved)
+            numbers, picture, residuals, damping = numbers + step, ahead, lower, damping / 10
+        if still and fresh:
             return numbers
+        if fresh := still:
+            jacobian, damping = problem.jacobian(numbers), _DAMPING
     return numbers
