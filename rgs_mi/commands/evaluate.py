@@ -42,7 +42,8 @@ _FACTS = {
 def reevaluate(run: str | Path, data: str | Path | None = None, quiet: bool = False) -> dict:
     """Measure the run in the folder ``run`` again, and write its metrics.json, pictures of test views, contact sheet and
     report anew. What metrics.json says of the fit stays, and LPIPS where its weights are not installed here; ``evaluated``
-    says where and by what this was measured. Where the fit learned cameras or exposures, the test views' are fitted again.
+    says where and by what this was measured. Where the fit learned cameras or exposures, the test views keep those that were
+    found for them.
 
     Args:
       data: the folder of its photographs (None: where metrics.json says that they were)
@@ -108,15 +109,14 @@ def _photographs(folder, scene, run, longest, quiet):
     dataset = load_dataset(folder, longest, quiet)
     views, sensors = results.evaluation_views(dataset), scene.sensors()
     same = [sensor_id(view.name) for view in views] == [sensor.id() for sensor in sensors]
-    learned = cameras.read(run, views) if same else None
+    registration = cameras.read(run, views) if same else None
     given = [view.camera for view in views]
-    if learned is not None:  # then sensors stand where these views were found to be, not where they were given
-        registration, found = learned
+    if registration is not None:  # then sensors stand where these views were found to be, not where they were given
         same = all(_sees_the_same(registration.cameras[view.name], view.camera) for view in views)
-        given = [found[view.name] for view in views]
+        given = [registration.found[view.name].camera for view in views]
     if not same or not all(_sees_the_same(Camera.from_sensor(s), camera) for s, camera in zip(sensors, given)):
         raise UserError(f"{folder}: its test views are not those of {run}: give the folder of its photographs with --data")
-    return dataset, learned and registration
+    return dataset, registration
 
 
 def _sees_the_same(camera, own):

@@ -21,27 +21,11 @@ from ..shading.lighting import Lighting
 from ..surfels.surfels import Surfels
 
 #: Pixels of a photograph's side that make one of a level's: steps of Levenberg and Marquardt, at most.
-_LEVELS = {4: 20, 2: 20, 1: 20}
+_LEVELS = {4: 12, 2: 12, 1: 12}
 _LEAST, _MOST = 24, 500  # pixels of a level's height, and of its longer side: more tell a pose hardly better
 _PROBE = 0.5  # pixels that differences of poses move a picture by
 _STILL = 0.02  # pixels: a step that moves a picture by less is the last
 _DAMPING = 1e-3  # of the diagonal, at first
-
-
-@dataclass(frozen=True)
-class Registration:
-    """Which numbers of held-out views are fitted: poses where cameras were learned, gains where exposures were; ``cameras``
-    {view's name: where it starts, which has the intrinsics that were learned}."""
-
-    poses: bool
-    exposure: bool
-    cameras: dict[str, Camera] = field(default_factory=dict)
-
-    @property
-    def words(self) -> str:
-        """What is fitted to what, as metrics.json says it."""
-        what = {(True, True): "pose and exposure", (True, False): "pose", (False, True): "exposure"}
-        return f"{what[self.poses, self.exposure]} fitted to the left half"
 
 
 @dataclass(frozen=True)
@@ -50,6 +34,24 @@ class Registered:
 
     camera: Camera
     gain: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Registration:
+    """Which numbers of held-out views are fitted: poses where cameras were learned, gains where exposures were; ``cameras``
+    {view's name: where it starts, which has the intrinsics that were learned}; ``found`` {view's name: what came out}, of views
+    that have been fitted before."""
+
+    poses: bool
+    exposure: bool
+    cameras: dict[str, Camera] = field(default_factory=dict)
+    found: dict[str, Registered] = field(default_factory=dict)
+
+    @property
+    def words(self) -> str:
+        """What is fitted to what, as metrics.json says it."""
+        what = {(True, True): "pose and exposure", (True, False): "pose", (False, True): "exposure"}
+        return f"{what[self.poses, self.exposure]} fitted to the left half"
 
 
 def register(
@@ -62,6 +64,8 @@ def register(
     about the middle of the surfels. Its derivatives are central differences of half a
     pixel: what is that far off is what counts, and no derivative kernels are compiled for it.
     """
+    if view.name in registration.found:
+        return registration.found[view.name]
     whole = registration.cameras.get(view.name, view.camera)
     pivot = np.median(surfels.numpy()["centers"], axis=0)
     numbers = np.zeros(len(POSE) + 3)

@@ -60,9 +60,9 @@ def _row(given: Camera, camera: Camera, gain: np.ndarray | None) -> dict[str, An
     }
 
 
-def read(folder: Path, views: Sequence[View]) -> tuple[Registration, dict[str, Camera]] | None:
-    """Return how the evaluation ``views`` of the run in ``folder`` found their place, and the cameras that they were found
-    to have; None where it learned nothing of cameras.
+def read(folder: Path, views: Sequence[View]) -> Registration | None:
+    """Return how the evaluation ``views`` of the run in ``folder`` found their place, and where; None where it learned nothing
+    of cameras.
 
     Raises: UserError where cameras.json is damaged, or says nothing of a view.
     """
@@ -71,14 +71,17 @@ def read(folder: Path, views: Sequence[View]) -> tuple[Registration, dict[str, C
         return None
     try:
         saved = json.loads(path.read_text())
-        starts, cameras = {}, {}
+        poses, exposure = (bool(saved["learned"][name]) for name in ("poses", "exposure"))
+        starts, found = {}, {}
         for view in views:
             row = saved["evaluated"][view.name]
             lens = Lens(**{name: float(value) for name, value in row["distortion"].items()})
             (fx, fy), (cx, cy), (width, height) = row["focal"], row["principal"], row["size"]
             of = lambda key: Camera(np.array(row[key], float).reshape(4, 4), (fx, fy), (cx, cy), (width, height), lens)
-            starts[view.name], cameras[view.name] = of("given"), of("to_world")
-        return Registration(bool(saved["learned"]["poses"]), bool(saved["learned"]["exposure"]), starts), cameras
+            starts[view.name] = of("given")
+            gain = np.array(row["gain"], float).reshape(3) if exposure else None
+            found[view.name] = Registered(of("to_world"), gain)
+        return Registration(poses, exposure, starts, found)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path}: damaged, or not of these photographs ({error}): fit again") from error
 
