@@ -81,7 +81,8 @@ def room(center, radius, floor):
 
 
 def directions(count, split):
-    """Unit directions [count, 3] from the object, spread over the elevations that people hold cameras at."""
+    """Unit directions [count, 3] from the object to the cameras of a ``split``, spread over the elevations that people hold them
+    at."""
     low, high = np.sin(np.radians(ELEVATIONS))
     z = low + (high - low) * (np.arange(count) + 0.5) / count
     azimuth = math.pi * (3 - math.sqrt(5)) * np.arange(count) + (split == "test")

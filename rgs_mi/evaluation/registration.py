@@ -58,7 +58,7 @@ def register(
     registration: Registration, surfels: Surfels, lighting: Lighting | None, view: View, background: float
 ) -> Registered:
     """Fit pose and exposure of ``view`` to the left half of its photograph, coarse to fine, in least squares of display values
-    over the grey level ``background``.
+    over the grey level ``background``, or return what was found before.
 
     Each level goes on from the one before, or from the pose as given where that is nearer. The pose is that of `learned_camera`
     about the middle of the surfels. Its derivatives are central differences of half a
@@ -162,14 +162,14 @@ def _minimized(problem, numbers, steps):
             if better := lower @ lower < residuals @ residuals:
                 break
             damping *= 10
-        still = not better or np.abs(step).max() < _STILL * problem.probe / _PROBE
+        missed, still = lower - residuals - both @ step, not better or np.abs(step).max() < _STILL * problem.probe / _PROBE
         if better:
-            pose = step[: len(POSE)]
-            if moved := pose @ pose:
-                jacobian += np.outer(lower - residuals - both @ step, pose / moved)
             numbers, picture, residuals, damping = numbers + step, ahead, lower, damping / 10
         if still and fresh:
-            return numbers
-        if fresh := still:
+            break
+        pose, fresh = step[: len(POSE)], still
+        if fresh:
             jacobian, damping = problem.jacobian(numbers), _DAMPING
+        elif moved := pose @ pose:
+            jacobian += np.outer(missed, pose / moved)
     return numbers

@@ -121,7 +121,7 @@ def test_normal_smoothness_equals_numpy(crease):
 @pytest.mark.parametrize(
     "loss",
     [
-        lambda gbuffer, camera: losses.depth_normal_consistency(gbuffer, camera),
+        losses.depth_normal_consistency,
         lambda gbuffer, camera: losses.normal_smoothness(gbuffer, np.ones((40, 48), bool), 0.3),
     ],
     ids=["consistency", "smoothness"],
@@ -129,17 +129,16 @@ def test_normal_smoothness_equals_numpy(crease):
 def test_gradients_by_neighbours_equal_finite_differences(loss):
     surfels, camera = sphere_surfels(400, scale=1.0, opacity_shift=3), orbit_camera(size=(48, 40))
     image = render_gbuffer(surfels, camera).image.numpy().astype(np.float32)
-    gbuffer = lambda values: GBuffer(camera.size, mi.Float(np.ascontiguousarray(values)), mi.Bool(True))
+    value = lambda numbers: loss(GBuffer(camera.size, numbers, mi.Bool(True)), camera)
     leaf = mi.Float(image)
     dr.enable_grad(leaf)
-    value = loss(GBuffer(camera.size, leaf, mi.Bool(True)), camera)
-    dr.backward(value)
+    dr.backward(value(leaf))
     gradient = dr.grad(leaf).numpy().astype(np.float64)
     alpha = image.reshape(-1, 16)[:, 12]
     counted = np.repeat((alpha == 0) | (np.abs(alpha - 0.5) > 0.05), 16)  # no step takes a pixel over the bound
     direction = np.where(counted, np.sign(gradient) * np.random.default_rng(0).uniform(0.5, 1, len(image)), 0)
     h = 1e-4
-    ahead, behind = (float(loss(gbuffer(image + k * h * direction.astype(np.float32)), camera)[0]) for k in (1, -1))
+    ahead, behind = (float(value(mi.Float(image + k * h * direction.astype(np.float32)))[0]) for k in (1, -1))
     assert np.abs(gradient).max() > 0
     assert (ahead - behind) / (2 * h) == pytest.approx((gradient * direction).sum(), rel=5e-3)
 
