@@ -24,6 +24,14 @@ def srgb(x: "mi.Color3f") -> "mi.Color3f":
     return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * dr.power(dr.maximum(x, 0.0031308), 1 / 2.4) - 0.055)
 
 
+def completed(color: "mi.Color3f", alpha: "mi.Float", left: float) -> "tuple[mi.Color3f, mi.Float]":
+    """Return premultiplied ``color`` and ``alpha`` as if pixels that end once their transmittance falls to ``left`` had gone
+    on: what is left shows more of the same. Else the background would shine through what hides it, where a finished
+    rendering has none of it."""
+    whole = dr.rcp(dr.maximum(alpha, 1 - left))
+    return color * whole, alpha * whole
+
+
 def display(color: "mi.Color3f", alpha: "mi.Float", background: "float | mi.Color3f") -> "mi.Color3f":
     """Composite premultiplied linear ``color`` over ``background``, of display values, in display space, as data
     sets with straight alpha are: srgb(color / alpha) alpha + background (1 − alpha)."""

@@ -20,8 +20,8 @@ LEAST_STEPS = 250, 1000  # that there must be time for at the next: at half reso
 def planned(settings: Settings, dataset: Dataset) -> Settings:
     """Return ``settings`` with numbers where they leave open what suits the photographs of ``dataset``:
 
-    - `density.max_surfels`: as many as a photograph shows pixels of the object, in the mean; but 15 000 a minute at most, and
-      50 000, and 5000 a minute, at least;
+    - `density.max_surfels`: 50 000, or 5000 a minute; of photographs, which have relief, as many as one shows pixels of the
+      object, in the mean, if that is more; but 15 000 a minute at most;
     - `initialization.surfels`: half of these, 25 000 at least;
     - `stages`: halves of halves down to some 200 pixels; from 20 % of the fit on all pixels, from 10 % on half of them along
       a side, and so on.
@@ -30,7 +30,8 @@ def planned(settings: Settings, dataset: Dataset) -> Settings:
     if (most := density.max_surfels) is None:
         minutes = settings.minutes or 0
         least, limit = (int(rate * minutes) for rate in _SURFELS_A_MINUTE)
-        most = max(_SURFELS, least, min(limit, int(np.mean([_foreground(view) for view in dataset.train]))))
+        shown = np.mean([_foreground(view) for view in dataset.train]) if dataset.photographed else 0
+        most = max(_SURFELS, least, min(limit, int(shown)))
     if first is None:
         first = min(max(_FIRST, most // 2), most)
     stages = settings.stages or _stages(max(dataset.train[0].camera.size))

@@ -14,7 +14,6 @@ from ..datasets.types import Dataset, DepthPrior
 from ..settings.settings import Settings, Stage
 from ..shading import deferred
 from ..shading.lighting import Lighting, Shading, lighting_of
-from ..splat.tiles import Cutoffs
 from ..surfels.proxies import Proxies
 from ..surfels.surfels import CHANNELS, Surfels
 from . import losses, reflection_guided
@@ -22,13 +21,12 @@ from .cameras import Cameras
 from .curves import Curves
 from .density import DensityControl
 from .model import ENVIRONMENT, Model
-from .objective import Objective
+from .objective import CUTOFFS, Objective
 from .plan import LAST, LEAST_STEPS, STEPS
 from .schedule import Schedule
 
 _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
 _PACE = 31  # steps whose median says how long one takes
-_CUTOFFS = Cutoffs(transmittance_min=1e-2)  # of a step: what the last hundredth of the light shows costs a third of all hits
 _DIVERGED = 10  # steps in a row without a finite error
 
 
@@ -266,7 +264,7 @@ class Fit:
             photo, gain, terms = replace(photo, camera=seen.camera), seen.gain, {"loss.cameras": seen.prior}
         means2d_offset = dr.zeros(mi.Vector2f, len(self.model))
         dr.enable_grad(means2d_offset)
-        image = deferred.render(surfels, photo.camera, lighting, means2d_offset, _CUTOFFS, self.objective.full)
+        image = deferred.render(surfels, photo.camera, lighting, means2d_offset, CUTOFFS, self.objective.full)
         consistency = self.schedule.value(self.settings.weights.consistency, self.progress)
         loss = self.objective(image, photo, self.dataset.train[i].masked, consistency, self.step_number, gain)
         terms |= loss.terms

@@ -163,8 +163,8 @@ class Density:
         default=None,
         ge=1,
         le=10_000_000,
-        description="Never more surfels than this; unless given, as many as photographs show pixels of the object, in the "
-        "mean, but 15,000 a minute at most; and 50,000, and 5,000 a minute, at least.",
+        description="Never more surfels than this; unless given, 50,000, or 5,000 a minute; of photographs, which have relief, as "
+        "many as one shows pixels of the object, if that is more, but 15,000 a minute at most.",
     )
     guided: bool = Field(
         default=False,

@@ -11,6 +11,7 @@ from rgs_mi.core.camera import Camera
 from rgs_mi.core.color import srgb_encode
 from rgs_mi.fit import losses
 from rgs_mi.splat.gbuffer import GBuffer, render_gbuffer
+from rgs_mi.splat.tiles import Cutoffs
 from rgs_mi.surfels.surfels import Surfels, rotation_from_normal
 
 from scenes import orbit_camera, sphere_surfels
@@ -313,3 +314,22 @@ def test_environment_total_variation_does_not_depend_on_resolution():
     assert losses.environment_total_variation(mi.TensorXf(np.full((16, 32, 3), 7.0, np.float32)))[0] == pytest.approx(
         0, abs=1e-5
     )
+
+
+def test_pixels_that_are_ended_early_have_no_hole():
+    """Surfels behind one another, of one colour: nothing of a bright background shines through them."""
+    truth = Surfels.from_numpy(sphere_surfels(300, seed=2, scale=0.9, opacity_shift=4).numpy(), two_sided=True)
+    camera, background, shown = orbit_camera(0, size=(40, 36), distance=9.0), 5.0, []
+    for cutoffs in (Cutoffs(), Cutoffs(transmittance_min=0.1)):
+        maps = render_gbuffer(truth, camera, cutoffs=cutoffs).all
+        grey = mi.Color3f(0.3) * maps.alpha
+        shown.append(
+            [
+                losses.display(*pixels, background).numpy()[0]
+                for pixels in ((grey, maps.alpha), losses.completed(grey, maps.alpha, cutoffs.transmittance_min))
+            ]
+        )
+    (whole, _), (ended, completed) = shown
+    opaque = whole < background * 1e-3 + srgb_encode(np.float32(0.3))
+    assert opaque.sum() > 100 and np.abs(ended - whole)[opaque].mean() > 0.05
+    assert np.abs(completed - whole)[opaque].mean() < 5e-3

@@ -22,23 +22,42 @@ def with_pixels(dataset, count):
 
 
 @pytest.mark.parametrize(
-    "minutes, scale, most",
-    [(10, 1, 50_000), (10, 4, 83 * 75 * 16), (5, 4, 75_000), (20, 1, 100_000), (None, 4, 50_000)],
+    "minutes, scale, photographed, most",
+    [
+        (8, 1, True, 50_000),
+        (10, 4, True, 83 * 75 * 16),
+        (5, 4, True, 75_000),
+        (20, 1, True, 100_000),
+        (None, 4, True, 50_000),
+        (10, 4, False, 50_000),
+        (30, 1, False, 150_000),
+    ],
 )
-def test_surfels_go_with_pixels_and_minutes(dataset, minutes, scale, most):
+def test_surfels_go_with_minutes_and_photographs_pixels(dataset, minutes, scale, photographed, most):
     settings = Settings(minutes=minutes, iterations=None if minutes else 100)
-    found = planned(settings, with_pixels(dataset, scale))
+    found = planned(settings, replace(with_pixels(dataset, scale), photographed=photographed))
     assert found.density.max_surfels == most and found.initialization.surfels == max(25_000, most // 2)
 
 
-def test_levels_begin_at_some_200_pixels(dataset):
-    stages = planned(Settings(), with_pixels(dataset, 10)).stages  # 830 pixels
-    assert [(s.until, s.downscale) for s in stages] == [(0.1, 4), (0.2, 2), (1.0, 1)]
+@pytest.mark.parametrize(
+    "scale, stages",
+    [
+        (1, [(0.2, 2), (1, 1)]),
+        (5, [(0.2, 2), (1, 1)]),
+        (10, [(0.1, 4), (0.2, 2), (1, 1)]),
+        (19, [(0.05, 8), (0.1, 4), (0.2, 2), (1, 1)]),
+    ],
+)
+def test_levels_begin_at_some_200_pixels(dataset, scale, stages):
+    found = planned(Settings(), with_pixels(dataset, scale)).stages  # 83 pixels times the scale
+    assert [(s.until, s.downscale) for s in found] == stages
 
 
 def test_what_is_asked_for_stays(dataset):
     asked = replace(SETTINGS, density=Density(max_surfels=7), initialization=Initialization(surfels=5))
     assert planned(asked, dataset) == asked
+    few = planned(Settings(density=Density(max_surfels=7)), dataset)
+    assert (few.density.max_surfels, few.initialization.surfels) == (7, 7)
 
 
 def test_jobs_know_their_fits(dataset):

@@ -12,10 +12,9 @@ from scipy import ndimage
 from rgs_mi.commands.optimize import start
 from rgs_mi.core.arrays import as_float
 from rgs_mi.datasets.photographs import Photographs
-from rgs_mi.datasets.types import Dataset, DepthPrior
+from rgs_mi.datasets.types import DepthPrior
 from rgs_mi.fit import losses, schedule
 from rgs_mi.fit.density import Gradients
-from rgs_mi.fit.plan import planned
 from rgs_mi.fit.trainer import Fit
 from rgs_mi.settings.settings import Density, Initialization, LearningRates, Settings, Stage, Weights
 from rgs_mi.shading import deferred
@@ -406,39 +405,3 @@ def test_opacities_to_start_with(dataset, where, opacity):
     np.testing.assert_allclose(surfels.opacities.numpy(), opacity, rtol=1e-5)
     settings = replace(settings, initialization=replace(settings.initialization, opacity=0.4))
     np.testing.assert_allclose(start(scene, data, settings).model.surfels(0).opacities.numpy(), 0.4, rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    "changes, pixels, most, first",
-    [
-        ({"minutes": 8.0}, 40, 50_000, 25_000),
-        ({"minutes": 30.0}, 40, 150_000, 75_000),
-        ({"minutes": None, "iterations": 10**6}, 400, 50_000, 25_000),
-        ({"minutes": 10.0}, 320, 102_400, 51_200),
-        ({"minutes": 4.0}, 320, 60_000, 30_000),
-        ({"minutes": 30.0, "density": Density(max_surfels=7)}, 40, 7, 7),
-        ({"initialization": Initialization(surfels=9)}, 40, 50_000, 9),
-    ],
-)
-def test_surfels_for_the_time_and_the_photographs(dataset, changes, pixels, most, first):
-    camera = replace(dataset.train[0].camera, size=(pixels, pixels))
-    view = replace(dataset.train[0], camera=camera, masked=False)
-    plan = planned(replace(Settings(), **changes), Dataset([view], []))
-    assert (plan.density.max_surfels, plan.initialization.surfels) == (most, first)
-
-
-@pytest.mark.parametrize(
-    "pixels, stages",
-    [
-        (64, [(0.2, 2), (1, 1)]),
-        (400, [(0.2, 2), (1, 1)]),
-        (800, [(0.1, 4), (0.2, 2), (1, 1)]),
-        (1600, [(0.05, 8), (0.1, 4), (0.2, 2), (1, 1)]),
-    ],
-)
-def test_the_pyramid_begins_at_some_200_pixels(dataset, pixels, stages):
-    view = replace(dataset.train[0], camera=replace(dataset.train[0].camera, size=(pixels, pixels // 2)), masked=False)
-    plan = planned(Settings(), Dataset([view], []))
-    assert [(s.until, s.downscale) for s in plan.stages] == stages and {s.views for s in plan.stages} == {1}
-    own = (Stage(1.0, 3, 2),)
-    assert planned(replace(Settings(), stages=own), Dataset([view], [])).stages == own
