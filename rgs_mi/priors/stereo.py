@@ -29,11 +29,12 @@ from . import hull
 PIXELS = 400**2  # of a photograph's copy, about
 _LEVELS, _ABOVE = 44, 4  # depths below the hull; those of them that lie above it
 _REACH = 0.75  # the deepest, over the hull's radius
-_INVERSE_LEVELS = 128  # depths where there is no hull
+_INVERSE_LEVELS, _FINER = 128, 4  # depths where there is no hull, and steps between two of them in the end
 _NEAREST = 0.25  # of these, over the least distance of a camera from what all look at
 _NEIGHBOURS, _BEST = 6, 3  # views that each is compared with, and those of them that count
 _BASELINE, _WIDEST = 10.0, 35.0  # degrees between the directions to two neighbours: wished, and at most
-_WINDOW = 2  # pixels on each side
+_WINDOW = 2  # pixels on each side, at least
+_WIDE = 1 / 64  # of the picture's size, where there is no hull, and much that is faint
 _FLAT = 1e-4  # variance of grey levels in a window that shows nothing
 SAME = 1.5  # levels between two depths that are the same
 WITNESSES = 16  # views that are asked whether they agree
@@ -59,10 +60,9 @@ class SmallImage:
         camera = view.camera.cropped(0, 0, w * factor, h * factor).resized(w, h)
         return cls(camera, np.ascontiguousarray(grey, np.float32))
 
-    @property
-    def normalized(self) -> np.ndarray:
-        """The grey levels less their mean over the window around each pixel, over its standard deviation, [H, W]."""
-        mean, square = (ndimage.uniform_filter(self.grey.astype(np.float64) ** k, 2 * _WINDOW + 1) for k in (1, 2))
+    def normalized(self, window: int = _WINDOW) -> np.ndarray:
+        """Return the grey levels less their mean over the ``window`` around each pixel, over its standard deviation, [H, W]."""
+        mean, square = (ndimage.uniform_filter(self.grey.astype(np.float64) ** k, 2 * window + 1) for k in (1, 2))
         return ((self.grey - mean) / np.sqrt(np.maximum(square - mean**2, _FLAT))).astype(np.float32)
 
 
@@ -76,6 +76,7 @@ class DepthMap:
     tolerance  [H, W] how far apart two depths may be, there, that are the same, in world units
     hull       [H, W] z-depth of the visual hull, NaN beside it; None without masks
     gain       [H, W] how much more alike they are than on the hull; None without masks
+    window     pixels on each side of those that were compared
     """
 
     camera: Camera
@@ -84,6 +85,7 @@ class DepthMap:
     tolerance: np.ndarray
     hull: np.ndarray | None = None
     gain: np.ndarray | None = None
+    window: int = _WINDOW
 
 
 def depth_maps(views: Sequence[View], mesh: tuple | None = None, quiet: bool = True, pixels: int = PIXELS) -> list[DepthMap]:
@@ -91,13 +93,15 @@ def depth_maps(views: Sequence[View], mesh: tuple | None = None, quiet: bool = T
     have no masks. ``quiet`` shows no progress. A JIT variant must be active."""
     with Progress(quiet=quiet, label="comparing the photographs") as progress:
         small = [SmallImage.of(view, pixels) for view in views]
-        cameras, images = [s.camera for s in small], [s.normalized for s in small]
+        size = np.sqrt(np.prod(small[0].camera.size))
+        window = max(_WINDOW, int(_WIDE * size)) if mesh is None else _WINDOW
+        cameras, images = [s.camera for s in small], [s.normalized(window) for s in small]
         surfaces = [None] * len(small) if mesh is None else hull.depth_maps(mesh[0], mesh[1], cameras)
         levels, step = _levels(cameras, mesh)
         target = focus_point(cameras)[0] if mesh is None else mesh[0].mean(0)
         maps = []
         for i in range(len(small)):
-            maps.append(_depth_map(i, cameras, images, surfaces, levels, step, neighbours(i, cameras, target)))
+            maps.append(_depth_map(i, cameras, images, surfaces, levels, step, neighbours(i, cameras, target), window))
             progress.update((i + 1) / len(small), views=i + 1)
         return maps
 
@@ -125,7 +129,7 @@ def neighbours(i: int, cameras: Sequence[Camera], target: np.ndarray, count: int
     return [int(j) for j in np.argsort(cost)[:count] if np.isfinite(cost[j])]
 
 
-def _depth_map(i, cameras, images, surfaces, levels, step, others):
+def _depth_map(i, cameras, images, surfaces, levels, step, others, window):
     """The `DepthMap` of view ``i``."""
     (width, height), surface = cameras[i].size, surfaces[i]
     known = np.ones((height, width), bool) if surface is None else np.isfinite(surface)
@@ -133,38 +137,40 @@ def _depth_map(i, cameras, images, surfaces, levels, step, others):
     likeness, gain = np.zeros((2, height, width), np.float32)
     tolerance = np.full((height, width), SAME * step, np.float32)
     if len(others) < 2 or not known.any():
-        return DepthMap(cameras[i], depth, likeness, tolerance, surface, gain)
-    (window,) = ndimage.find_objects(known.astype(np.int8))
-    rows, columns = window
+        return DepthMap(cameras[i], depth, likeness, tolerance, surface, gain, window)
+    (part,) = ndimage.find_objects(known.astype(np.int8))
+    rows, columns = part
     camera = cameras[i].cropped(columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start)
     base = np.zeros(known.shape) if surface is None else np.where(known, surface, np.nanmax(surface))
-    at = lambda level: 1 / level if surface is None else base[window] + level
-    score = sweep(
-        camera,
-        images[i][window],
-        [at(level) for level in levels],
-        [(cameras[j], images[j], surfaces[j]) for j in others],
-        (SAME + 0.5) * step,
+    at = lambda level: 1 / level if surface is None else base[part] + level
+    shown = [(cameras[j], images[j], surfaces[j]) for j in others]
+    swept = lambda levels: sweep(
+        camera, images[i][part], [at(level) for level in levels], shown, (SAME + 0.5) * step, window
     )
-    best, offset, likeness[window] = _peak(score)
-    found = at(np.interp(best + offset, np.arange(len(levels)), levels))
-    depth[window] = np.where(known[window], found, np.nan)
+    score = swept(levels)
+    place, likeness[part] = _peak(score)
+    level = np.interp(place, np.arange(len(levels)), levels)
+    if surface is None:  # there a level is some pixels of the neighbours
+        finer = np.arange(-_FINER, _FINER + 1) / _FINER
+        place, likeness[part] = _peak(swept([np.maximum(level + k * step, levels[-1]) for k in finer]))
+        level = np.maximum(level + np.interp(place, np.arange(len(finer)), finer) * step, levels[-1])
+    found = at(level)
+    depth[part] = np.where(known[part], found, np.nan)
     if surface is None:
-        tolerance[window] = SAME * step * found**2
-        return DepthMap(cameras[i], depth, likeness, tolerance)
-    gain[window] = likeness[window] - score[: _ABOVE + 2].max(0)
-    return DepthMap(cameras[i], depth, np.where(known, likeness, 0), tolerance, surface, gain)
+        tolerance[part] = SAME * step * found**2
+        return DepthMap(cameras[i], depth, likeness, tolerance, window=window)
+    gain[part] = likeness[part] - score[: _ABOVE + 2].max(0)
+    return DepthMap(cameras[i], depth, np.where(known, likeness, 0), tolerance, surface, gain, window)
 
 
 def _peak(score):
-    """Where the greatest of ``score`` [L, H, W] is in each pixel: its level, its place between levels by a parabola, and its
-    value."""
+    """Where the greatest of ``score`` [L, H, W] is in each pixel, between levels by a parabola, and its value."""
     best = score.argmax(0)
     middle = np.clip(best, 1, len(score) - 2)
     before, here, after = (np.take_along_axis(score, (middle + k)[None], 0)[0] for k in (-1, 0, 1))
     bend = before - 2 * here + after
     offset = np.where((middle == best) & (bend < -1e-6), 0.5 * (before - after) / np.minimum(bend, -1e-6), 0)
-    return best, np.clip(offset, -0.5, 0.5), score.max(0)
+    return best + np.clip(offset, -0.5, 0.5), score.max(0)
 
 
 # ---- How alike ----
@@ -176,12 +182,13 @@ def sweep(
     depths: Sequence[np.ndarray | float],
     others: Sequence[tuple[Camera, np.ndarray, np.ndarray | None]],
     margin: float = 0.0,
+    window: int = _WINDOW,
 ) -> np.ndarray:
     """Return how much the surroundings of each pixel of ``image`` look like what ``others`` show if it lies at each of
     ``depths``: [L, H, W], the mean of the best few correlations, at least −1.
 
     Args:
-      camera, image: of the view, [H, W], as `SmallImage.normalized`
+      camera, image: of the view, [H, W], as `SmallImage.normalized` has it with this ``window``
       depths: L times z-depths [H, W], or one of all pixels, in world units
       others: the same of other views, and of each its hull's depth, NaN beside it, or None. A view counts where the point is in
         its frame and not more than ``margin`` above its hull
@@ -199,7 +206,7 @@ def sweep(
         z = as_float(depth) if isinstance(depth, np.ndarray) else dr.opaque(mi.Float, float(depth))
         point = origin + rays * z
         found = [_warp(point, *other, margin) for other in placed]
-        means = _means([dr.select(inside, value * own, -1) for value, inside in found], width, height)
+        means = _means([dr.select(inside, value * own, -1) for value, inside in found], width, height, window)
         best = [mi.Float(-1)] * min(_BEST, len(placed))
         for mean, (_, inside) in zip(means, found):
             mean = dr.select(inside, mean, -1)
@@ -231,18 +238,18 @@ def _warp(point, other, image, surface, margin):
     return value, inside
 
 
-def _means(images, width, height):
+def _means(images, width, height, window):
     """Means of ``images`` over windows, which end at the border."""
     index = dr.arange(mi.UInt32, width * height)
     columns, rows = dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, height)
     for position, extent, stride in ((index % columns, columns, 1), (index // columns, rows, columns)):
         dr.eval(images)
         sums = [mi.Float(0)] * len(images)
-        for offset in range(-_WINDOW, _WINDOW + 1):
+        for offset in range(-window, window + 1):
             moved = dr.clip(mi.Int32(position) + offset, 0, mi.Int32(extent) - 1) - mi.Int32(position)
             at = mi.UInt32(mi.Int32(index) + moved * mi.Int32(stride))
             sums = [s + dr.gather(mi.Float, image, at) for s, image in zip(sums, images)]
-        images = [s / (2 * _WINDOW + 1) for s in sums]
+        images = [s / (2 * window + 1) for s in sums]
     return images
 
 
@@ -263,7 +270,7 @@ def verified(maps: Sequence[DepthMap]) -> list[DepthMap]:
         count, same, through = _agreement(points, [maps[j] for j in neighbours(i, cameras, center, WITNESSES)])
         alike = (count >= VIEWS) & (same > _AGREED * (same + through)) & (depth > 0)
         alike = alike.numpy().reshape(m.depth.shape).astype(np.float32)
-        alike *= ndimage.uniform_filter(alike, 2 * _WINDOW + 1) > _AGREED
+        alike *= ndimage.uniform_filter(alike, 2 * m.window + 1) > _AGREED
         kept.append(replace(m, likeness=m.likeness * alike))
     return kept
 

@@ -162,8 +162,8 @@ def test_a_sweep_is_what_loops_say():
     depths = hull.depth_maps(*mesh[:2], [s.camera for s in small])
     levels, margin = [-0.02, 0.05, 0.2], 0.03
     filled = np.nan_to_num(depths[0], nan=1.0)
-    others = [(s.camera, s.normalized, d) for s, d in zip(small[1:], depths[1:])]
-    mine = stereo.sweep(small[0].camera, small[0].normalized, [filled + below for below in levels], others, margin)
+    others = [(s.camera, s.normalized(), d) for s, d in zip(small[1:], depths[1:])]
+    mine = stereo.sweep(small[0].camera, small[0].normalized(), [filled + below for below in levels], others, margin)
     rng = np.random.default_rng(0)
     inner = np.argwhere(ndimage.binary_erosion(np.isfinite(depths[0]), iterations=4))
     for row, column in inner[rng.permutation(len(inner))[:25]]:
@@ -185,7 +185,7 @@ def likeness(here, depth, camera, image, surface, row, column, margin):
     if not allowed[12]:
         return -1.0
     seen = ndimage.map_coordinates(image, pixel.T[::-1], order=1)
-    return np.where(allowed, here.normalized[rows, columns].ravel() * seen, -1).mean()
+    return np.where(allowed, here.normalized()[rows, columns].ravel() * seen, -1).mean()
 
 
 def depth_map(rng, camera):
