@@ -128,7 +128,7 @@ def test_without_masks_points_lie_on_surfaces_too():
 
 def test_without_masks_walls_do_not_colour_what_they_hide():
     bare = [View(v.name, v.camera, v.pixels | np.uint8([0, 0, 0, 255]), False, None, None) for v in textured_tray()]
-    points, _, colors, _ = initial_points(Dataset(bare, []), 3000)
+    points, _, colors, _ = initial_points(Dataset(bare, []), 4500)
     floor = on_floor(*points.T)
     alone = photographs({"floor": tray(0.25)["floor"]})[0]
     column, row = alone.camera.project(points[floor])[0].astype(int).T
