@@ -20,8 +20,8 @@ from ..shading import deferred
 from ..shading.lighting import Lighting
 from ..surfels.surfels import Surfels
 
-#: Pixels of a photograph's side that make one of a level's: steps of Levenberg and Marquardt, at most.
-_LEVELS = {4: 12, 2: 12, 1: 12}
+_LEVELS = 4, 2, 1  # pixels of a photograph's side that make one of a level's
+_STEPS = 12  # of Levenberg and Marquardt's method at a level, at most
 _LEAST, _MOST = 24, 500  # pixels of a level's height, and of its longer side: more tell a pose hardly better
 _PROBE = 0.5  # pixels that differences of poses move a picture by
 _STILL = 0.02  # pixels: a step that moves a picture by less is the last
@@ -69,7 +69,7 @@ def register(
     whole = registration.cameras.get(view.name, view.camera)
     pivot = np.median(surfels.numpy()["centers"], axis=0)
     numbers = np.zeros(len(POSE) + 3)
-    for downscale, steps in _LEVELS.items():
+    for downscale in _LEVELS:
         small = downscale > 1 and view.camera.size[1] < _LEAST * downscale
         large = downscale < max(_LEVELS) and max(view.camera.size) > _MOST * downscale
         if small or large:
@@ -77,7 +77,7 @@ def register(
         problem = _Problem(registration, surfels, lighting, view, whole, pivot, background, downscale)
         # A coarse level may lead astray: surfels are hardly seen there as photographs are shrunk
         numbers = min((numbers, np.r_[np.zeros(len(POSE)), numbers[len(POSE) :]]), key=problem.error)
-        numbers = _minimized(problem, numbers, steps)
+        numbers = _minimized(problem, numbers)
     camera = _moved(whole, whole, pivot, numbers[: len(POSE)]).baked() if registration.poses else whole
     return Registered(camera, np.exp(numbers[len(POSE) :]) if registration.exposure else None)
 
@@ -146,13 +146,13 @@ class _Problem:
         return columns
 
 
-def _minimized(problem, numbers, steps):
-    """So many ``steps`` of Levenberg and Marquardt's method at most, from ``numbers``. Twelve renderings make a Jacobian, so
+def _minimized(problem, numbers):
+    """`_STEPS` of Levenberg and Marquardt's method at most, from ``numbers``. Twelve renderings make a Jacobian, so
     each step corrects that of the one before by what it has seen (Broyden 1965). Only where one leads nowhere, or hardly
     anywhere, is it taken anew, to see whether that is the end."""
     damping, picture = _DAMPING, problem.rendered(numbers)
     residuals, jacobian, fresh = problem.residuals(picture, numbers), problem.jacobian(numbers), True
-    for _ in range(steps):
+    for left in reversed(range(_STEPS)):
         both = np.hstack([jacobian, problem.by_gains(picture, numbers)])
         normal, right = both.T @ both, both.T @ residuals
         for _ in range(4 if fresh else 1):
@@ -165,7 +165,7 @@ def _minimized(problem, numbers, steps):
         missed, still = lower - residuals - both @ step, not better or np.abs(step).max() < _STILL * problem.probe / _PROBE
         if better:
             numbers, picture, residuals, damping = numbers + step, ahead, lower, damping / 10
-        if still and fresh:
+        if not left or (still and fresh):
             break
         pose, fresh = step[: len(POSE)], still
         if fresh:

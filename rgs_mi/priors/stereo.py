@@ -149,11 +149,11 @@ def _depth_map(i, cameras, images, surfaces, levels, step, others, window):
     )
     score = swept(levels)
     place, likeness[part] = _peak(score)
-    level = np.interp(place, np.arange(len(levels)), levels)
+    level = levels[0] + place * (levels[1] - levels[0])
     if surface is None:  # there a level is some pixels of the neighbours
-        finer = np.arange(-_FINER, _FINER + 1) / _FINER
-        place, likeness[part] = _peak(swept([np.maximum(level + k * step, levels[-1]) for k in finer]))
-        level = np.maximum(level + np.interp(place, np.arange(len(finer)), finer) * step, levels[-1])
+        beside = lambda place: np.maximum(level + (place / _FINER - 1) * step, levels[-1])
+        place, likeness[part] = _peak(swept([beside(k) for k in range(2 * _FINER + 1)]))
+        level = beside(place)
     found = at(level)
     depth[part] = np.where(known[part], found, np.nan)
     if surface is None:

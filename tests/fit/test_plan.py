@@ -28,6 +28,7 @@ def with_pixels(dataset, count):
         (10, 4, True, 83 * 75 * 16),
         (5, 4, True, 75_000),
         (20, 1, True, 100_000),
+        (4, 4, True, 60_000),
         (None, 4, True, 50_000),
         (10, 4, False, 50_000),
         (30, 1, False, 150_000),
@@ -50,7 +51,7 @@ def test_surfels_go_with_minutes_and_photographs_pixels(dataset, minutes, scale,
 )
 def test_levels_begin_at_some_200_pixels(dataset, scale, stages):
     found = planned(Settings(), with_pixels(dataset, scale)).stages  # 83 pixels times the scale
-    assert [(s.until, s.downscale) for s in found] == stages
+    assert [(s.until, s.downscale) for s in found] == stages and {s.views for s in found} == {1}
 
 
 def test_what_is_asked_for_stays(dataset):
@@ -58,6 +59,10 @@ def test_what_is_asked_for_stays(dataset):
     assert planned(asked, dataset) == asked
     few = planned(Settings(density=Density(max_surfels=7)), dataset)
     assert (few.density.max_surfels, few.initialization.surfels) == (7, 7)
+    first = planned(Settings(initialization=Initialization(surfels=9)), dataset)
+    assert (first.density.max_surfels, first.initialization.surfels) == (50_000, 9)
+    own = (Stage(1.0, 3, 2),)
+    assert planned(Settings(stages=own), dataset).stages == own
 
 
 def test_jobs_know_their_fits(dataset):
