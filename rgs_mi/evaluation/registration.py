@@ -1,8 +1,8 @@
 """Held-out photographs find their place: pose and exposure fitted to a part of each, everything else fixed.
 
 Where a fit learns cameras its world is its own, and a held-out photograph's pose is off in it by as much as the fit has
-corrected those that it saw. So nine numbers are fitted to the left half of each, as others do (NeRF--, BARF, NeRF in the
-Wild), and the whole is scored.
+corrected those that it saw. So nine numbers are fitted to every other square of each, and the whole is scored. Others take the
+left half (NeRF in the Wild), which tells exposures but hardly a turn about itself, or all of it (NeRF--, BARF).
 """
 
 from dataclasses import dataclass, field, replace
@@ -20,6 +20,7 @@ from ..shading import deferred
 from ..shading.lighting import Lighting
 from ..surfels.surfels import Surfels
 
+PARTS = 4  # of a photograph along a side, on every other of which it is fitted
 _LEVELS = 4, 2, 1  # pixels of a photograph's side that make one of a level's
 _STEPS = 12  # of Levenberg and Marquardt's method at a level, at most
 _LEAST, _MOST = 24, 500  # pixels of a level's height, and of its longer side: more tell a pose hardly better
@@ -51,14 +52,14 @@ class Registration:
     def words(self) -> str:
         """What is fitted to what, as metrics.json says it."""
         what = {(True, True): "pose and exposure", (True, False): "pose", (False, True): "exposure"}
-        return f"{what[self.poses, self.exposure]} fitted to the left half"
+        return f"{what[self.poses, self.exposure]} fitted to every other of {PARTS} x {PARTS} parts"
 
 
 def register(
     registration: Registration, surfels: Surfels, lighting: Lighting | None, view: View, background: float
 ) -> Registered:
-    """Fit pose and exposure of ``view`` to the left half of its photograph, coarse to fine, in least squares of display values
-    over the grey level ``background``, or return what was found before.
+    """Fit pose and exposure of ``view`` to every other of `PARTS` × `PARTS` parts of its photograph, as on a chessboard, coarse to
+    fine, in least squares of display values over the grey level ``background``, or return what was found before.
 
     Each level goes on from the one before, or from the pose as given where that is nearer. The pose is that of `learned_camera`
     about the middle of the surfels. Its derivatives are central differences of half a
@@ -76,10 +77,17 @@ def register(
             continue
         problem = _Problem(registration, surfels, lighting, view, whole, pivot, background, downscale)
         # A coarse level may lead astray: surfels are hardly seen there as photographs are shrunk
-        numbers = min((numbers, np.r_[np.zeros(len(POSE)), numbers[len(POSE) :]]), key=problem.error)
-        numbers = _minimized(problem, numbers)
+        starts = np.unique([numbers, np.r_[np.zeros(len(POSE)), numbers[len(POSE) :]]], axis=0)
+        seen = [(problem.rendered(start), start) for start in starts]
+        numbers = _minimized(problem, *min(seen, key=lambda start: np.square(problem.residuals(*start)).sum()))
     camera = _moved(whole, whole, pivot, numbers[: len(POSE)]).baked() if registration.poses else whole
     return Registered(camera, np.exp(numbers[len(POSE) :]) if registration.exposure else None)
+
+
+def chessboard(width: int, height: int) -> np.ndarray:
+    """Return which pixels a photograph of this size is fitted on, [H, W] bool: those of every other of `PARTS` × `PARTS` parts."""
+    row, column = np.mgrid[:height, :width]
+    return (column * PARTS // width + row * PARTS // height) % 2 == 0
 
 
 def _moved(camera, whole, pivot, pose):
@@ -96,14 +104,14 @@ class _Problem:
         self.whole, self.pivot = whole, pivot
         target = shrink(display(view.pixels, background), downscale)
         height, width = target.shape[:2]
-        part = max(width // 2, 1)
         used = (
             whole
             if target.shape[:2] == view.pixels.shape[:2]
             else whole.cropped(0, 0, width * downscale, height * downscale)
         )
-        self.camera = used.resized(width, height).cropped(0, 0, part, height)
-        self.target = target[:, :part].reshape(-1, 3)
+        self.camera = used.resized(width, height)
+        self.fitted = chessboard(width, height).ravel()
+        self.target = target.reshape(-1, 3)[self.fitted]
         self.probe = _PROBE / float(np.mean(self.camera.focal))
 
     def rendered(self, numbers):
@@ -113,7 +121,7 @@ class _Problem:
             camera = _moved(camera, self.whole, self.pivot, numbers[: len(POSE)])
         with dr.suspend_grad():
             image = deferred.render(self.surfels, camera, self.lighting)
-            return image.color.numpy().T, image.gbuffer.all.alpha.numpy()[:, None]
+            return image.color.numpy().T[self.fitted], image.gbuffer.all.alpha.numpy()[self.fitted, None]
 
     def residuals(self, picture, numbers):
         """[3 P]: the ``picture`` of `rendered`, as exposed, less the photograph."""
@@ -121,10 +129,6 @@ class _Problem:
         straight = color * np.exp(numbers[len(POSE) :]) / np.maximum(alpha, 1e-6)
         shown = srgb_encode(np.clip(straight, 0, 1)) * alpha + self.background * (1 - alpha)
         return (np.clip(shown, 0, 1) - self.target).ravel()
-
-    def error(self, numbers):
-        """The sum of squared residuals."""
-        return np.square(self.residuals(self.rendered(numbers), numbers)).sum()
 
     def jacobian(self, numbers):
         """[3 P, 6] derivatives by the pose, central differences of renderings; zero where it is not fitted."""
@@ -146,12 +150,11 @@ class _Problem:
         return columns
 
 
-def _minimized(problem, numbers):
-    """`_STEPS` of Levenberg and Marquardt's method at most, from ``numbers``. Twelve renderings make a Jacobian, so
+def _minimized(problem, picture, numbers):
+    """`_STEPS` of Levenberg and Marquardt's method at most, from ``numbers``, which have this ``picture``. Twelve renderings make a Jacobian, so
     each step corrects that of the one before by what it has seen (Broyden 1965). Only where one leads nowhere, or hardly
     anywhere, is it taken anew, to see whether that is the end."""
-    damping, picture = _DAMPING, problem.rendered(numbers)
-    residuals, jacobian, fresh = problem.residuals(picture, numbers), problem.jacobian(numbers), True
+    residuals, jacobian, damping, fresh = problem.residuals(picture, numbers), problem.jacobian(numbers), _DAMPING, True
     for left in reversed(range(_STEPS)):
         both = np.hstack([jacobian, problem.by_gains(picture, numbers)])
         normal, right = both.T @ both, both.T @ residuals

@@ -9,9 +9,11 @@ import numpy as np
 from ..datasets.types import Dataset, View
 from ..settings.settings import Settings, Stage
 
-_SURFELS, _SURFELS_A_MINUTE = 50_000, (5_000, 15_000)  # at least; a minute at least, and at most
+_SURFELS, _A_MINUTE = 50_000, 5_000  # surfels at least, and a minute
+_PHOTOGRAPHED, _UNMASKED = 15_000, 25_000  # a minute at most, of photographs, and of those without masks
+_MOST_UNMASKED = 250_000  # more need time that each is then seen too rarely in, and memory
 _FIRST = 25_000  # surfels to start with, at least
-_COARSEST, _FINEST_FROM = 200, 0.2  # pixels along the longer side, about; the part of the fit before full resolution
+_COARSEST, _FINEST_FROM = 220, 0.2  # side of a square of as many pixels, about; the part of the fit before full resolution
 STEPS = 500, 1000  # of a level before the next: of one below half resolution, and of that
 LAST = 0.25  # of the fit: there half as fine is not fine enough, if every view can be seen once more
 LEAST_STEPS = 250, 1000  # that there must be time for at the next: at half resolution and below, and at full resolution
@@ -21,20 +23,20 @@ def planned(settings: Settings, dataset: Dataset) -> Settings:
     """Return ``settings`` with numbers where they leave open what suits the photographs of ``dataset``:
 
     - `density.max_surfels`: 50 000, or 5000 a minute; of photographs, which have relief, as many as one shows pixels of the
-      object, in the mean, if that is more; but 15 000 a minute at most;
-    - `initialization.surfels`: half of these, 25 000 at least;
-    - `stages`: halves of halves down to some 200 pixels; from 20 % of the fit on all pixels, from 10 % on half of them along
-      a side, and so on.
+      object, in the mean, if that is more; but 15 000 a minute at most, and 25 000, up to 250 000, where they have no masks;
+    - `initialization.surfels`: half of these, or three quarters where photographs have no masks; 25 000 at least;
+    - `stages`: halves of halves down to the pixels of a square of some 220; from 20 % of the fit on all pixels, from 10 % on
+      half of them along a side, and so on.
     """
-    density, first = settings.density, settings.initialization.surfels
+    density, first, minutes = settings.density, settings.initialization.surfels, settings.minutes or 0
+    bare = dataset.photographed and not any(view.masked for view in dataset.train)
     if (most := density.max_surfels) is None:
-        minutes = settings.minutes or 0
-        least, limit = (int(rate * minutes) for rate in _SURFELS_A_MINUTE)
+        limit = min(_UNMASKED * minutes, _MOST_UNMASKED) if bare else _PHOTOGRAPHED * minutes
         shown = np.mean([_foreground(view) for view in dataset.train]) if dataset.photographed else 0
-        most = max(_SURFELS, least, min(limit, int(shown)))
+        most = int(max(_SURFELS, _A_MINUTE * minutes, min(limit, shown)))
     if first is None:
-        first = min(max(_FIRST, most // 2), most)
-    stages = settings.stages or _stages(max(dataset.train[0].camera.size))
+        first = min(max(_FIRST, most * 3 // 4 if bare else most // 2), most)
+    stages = settings.stages or _stages(np.prod(dataset.train[0].camera.size))
     return replace(
         settings,
         density=replace(density, max_surfels=most),
@@ -83,7 +85,7 @@ def _foreground(view: View) -> float:
 
 
 def _stages(pixels: int) -> tuple[Stage, ...]:
-    """The pyramid of photographs so many ``pixels`` along their longer side."""
-    halvings = max(1, round(np.log2(pixels / _COARSEST)))
+    """The pyramid of photographs of so many ``pixels``."""
+    halvings = max(1, round(np.log2(np.sqrt(pixels) / _COARSEST)))
     coarse = (Stage(_FINEST_FROM / 2 ** (k - 1), 2**k, 1) for k in range(halvings, 0, -1))
     return *coarse, Stage(1.0, 1, 1)

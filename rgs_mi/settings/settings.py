@@ -36,7 +36,8 @@ class Initialization:
         default=None,
         ge=1,
         le=10_000_000,
-        description="The fit starts with so many surfels; unless given, half of `density.max_surfels`, 25,000 at least.",
+        description="The fit starts with so many surfels; unless given, half of `density.max_surfels`, or three quarters where "
+        "photographs have no masks; 25,000 at least.",
     )
     hull: bool = Field(
         default=True,
@@ -164,7 +165,8 @@ class Density:
         ge=1,
         le=10_000_000,
         description="Never more surfels than this; unless given, 50,000, or 5,000 a minute; of photographs, which have relief, "
-        "as many as one shows pixels of the object, if that is more, but 15,000 a minute at most.",
+        "as many as one shows pixels of the object, if that is more, but 15,000 a minute at most; without masks 25,000, up to "
+        "250,000.",
     )
     guided: bool = Field(
         default=False,
@@ -274,7 +276,7 @@ class Settings:
     stages: tuple[Stage, ...] | None = Field(
         default=None,
         description="The coarse-to-fine pyramid, a mapping of `until`, `downscale` and `views` for each level; unless given, by "
-        "halves, from some 200 pixels along the longer side to all of them from 20 % of the fit on. Bounded by `minutes`, a fit "
+        "halves, from the pixels of a square of some 220 to all of them from 20 % of the fit on. Bounded by `minutes`, a fit "
         "stays at a level where there is no time for enough steps at the next.",
     )
     initialization: Initialization = Initialization()

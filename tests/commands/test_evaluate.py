@@ -70,7 +70,7 @@ def test_cameras_that_were_learned(inputs, tmp_path):
     settings = ["cameras=learned", "exposure=learned", "cameras_start=0", "iterations=40"]
     folder = fit(inputs, tmp_path / "run", *settings)
     before, rows = metrics(folder), json.loads((folder / "cameras.json").read_text())
-    assert before["test_cameras"] == "pose and exposure fitted to the left half"
+    assert before["test_cameras"] == "pose and exposure fitted to every other of 4 x 4 parts"
     assert len(rows["train"]) == 12 and len(rows["evaluated"]) == 3
     assert all(row["to_world"] != row["given"] for split in ("train", "evaluated") for row in rows[split].values())
     assert before["cameras"]["rotation_deg"]["max"] > 0 and before["cameras"]["exposure_ev"]["max"] > 0

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from rgs_mi.fit.plan import LAST, LEAST_STEPS, STEPS, agree, planned, told
@@ -12,45 +13,53 @@ from rgs_mi.settings.settings import Density, Initialization, Settings, Stage
 from fits import SETTINGS, model
 
 
-def with_pixels(dataset, count):
-    """``dataset`` with cameras that see so many times as many pixels a side, all of the object, and no pictures."""
+def with_pixels(dataset, count, masked=False):
+    """``dataset`` with cameras that see so many times as many pixels a side, all of the object, in photographs that are white."""
     views = []
     for view in dataset.train:
-        width, height = view.camera.size
-        views.append(replace(view, camera=view.camera.resized(width * count, height * count), masked=False))
+        camera = view.camera.resized(view.camera.size[0] * count, view.camera.size[1] * count)
+        white = np.broadcast_to(np.uint8(255), (*camera.size[::-1], 4))
+        views.append(replace(view, camera=camera, pixels=white, masked=masked))
     return replace(dataset, train=views)
 
 
 @pytest.mark.parametrize(
-    "minutes, scale, photographed, most",
+    "minutes, scale, photographed, masked, most",
     [
-        (8, 1, True, 50_000),
-        (10, 4, True, 83 * 75 * 16),
-        (5, 4, True, 75_000),
-        (20, 1, True, 100_000),
-        (4, 4, True, 60_000),
-        (None, 4, True, 50_000),
-        (10, 4, False, 50_000),
-        (30, 1, False, 150_000),
+        (8, 1, True, True, 50_000),
+        (10, 4, True, True, 83 * 75 * 16),
+        (5, 4, True, True, 75_000),
+        (20, 1, True, True, 100_000),
+        (4, 4, True, True, 60_000),
+        (None, 4, True, True, 50_000),
+        (10, 4, False, True, 50_000),
+        (30, 1, False, True, 150_000),
+        (10, 4, False, False, 50_000),
+        (3, 4, True, False, 75_000),
+        (10, 4, True, False, 83 * 75 * 16),
+        (30, 8, True, False, 250_000),
+        (60, 8, True, False, 300_000),
     ],
 )
-def test_surfels_go_with_minutes_and_photographs_pixels(dataset, minutes, scale, photographed, most):
+def test_surfels_go_with_minutes_and_photographs_pixels(dataset, minutes, scale, photographed, masked, most):
     settings = Settings(minutes=minutes, iterations=None if minutes else 100)
-    found = planned(settings, replace(with_pixels(dataset, scale), photographed=photographed))
-    assert found.density.max_surfels == most and found.initialization.surfels == max(25_000, most // 2)
+    found = planned(settings, replace(with_pixels(dataset, scale, masked), photographed=photographed))
+    first = int(most * (0.75 if photographed and not masked else 0.5))
+    assert found.density.max_surfels == most and found.initialization.surfels == max(25_000, first)
 
 
 @pytest.mark.parametrize(
     "scale, stages",
     [
         (1, [(0.2, 2), (1, 1)]),
-        (5, [(0.2, 2), (1, 1)]),
-        (10, [(0.1, 4), (0.2, 2), (1, 1)]),
-        (19, [(0.05, 8), (0.1, 4), (0.2, 2), (1, 1)]),
+        (7, [(0.2, 2), (1, 1)]),
+        (8, [(0.1, 4), (0.2, 2), (1, 1)]),
+        (15, [(0.1, 4), (0.2, 2), (1, 1)]),
+        (16, [(0.05, 8), (0.1, 4), (0.2, 2), (1, 1)]),
     ],
 )
-def test_levels_begin_at_some_200_pixels(dataset, scale, stages):
-    found = planned(Settings(), with_pixels(dataset, scale)).stages  # 83 pixels times the scale
+def test_levels_begin_at_a_square_of_some_220_pixels(dataset, scale, stages):
+    found = planned(Settings(), with_pixels(dataset, scale)).stages  # 83 x 75 pixels times the scale
     assert [(s.until, s.downscale) for s in found] == stages and {s.views for s in found} == {1}
 
 
