@@ -58,12 +58,12 @@ class Registration:
 def register(
     registration: Registration, surfels: Surfels, lighting: Lighting | None, view: View, background: float
 ) -> Registered:
-    """Fit pose and exposure of ``view`` to every other of `PARTS` × `PARTS` parts of its photograph, as on a chessboard, coarse to
+    """Fit pose and exposure of ``view`` to every other of `PARTS` × `PARTS` parts of its photograph (`chessboard`), coarse to
     fine, in least squares of display values over the grey level ``background``, or return what was found before.
 
     Each level goes on from the one before, or from the pose as given where that is nearer. The pose is that of `learned_camera`
-    about the middle of the surfels. Its derivatives are central differences of half a
-    pixel: what is that far off is what counts, and no derivative kernels are compiled for it.
+    about the middle of the surfels. Its derivatives are central differences of half a pixel: what is that far off is what
+    counts, and no derivative kernels are compiled for it.
     """
     if view.name in registration.found:
         return registration.found[view.name]
@@ -85,7 +85,7 @@ def register(
 
 
 def chessboard(width: int, height: int) -> np.ndarray:
-    """Return which pixels a photograph of this size is fitted on, [H, W] bool: those of every other of `PARTS` × `PARTS` parts."""
+    """Return which pixels of a photograph of this size are fitted, [H, W] bool: every other of `PARTS` × `PARTS` parts."""
     row, column = np.mgrid[:height, :width]
     return (column * PARTS // width + row * PARTS // height) % 2 == 0
 
@@ -151,9 +151,9 @@ class _Problem:
 
 
 def _minimized(problem, picture, numbers):
-    """`_STEPS` of Levenberg and Marquardt's method at most, from ``numbers``, which have this ``picture``. Twelve renderings make a Jacobian, so
-    each step corrects that of the one before by what it has seen (Broyden 1965). Only where one leads nowhere, or hardly
-    anywhere, is it taken anew, to see whether that is the end."""
+    """`_STEPS` of Levenberg and Marquardt's method at most, from ``numbers``, which have this ``picture``. Twelve renderings
+    make a Jacobian, so each step corrects that of the one before by what it has seen (Broyden 1965). Only where one leads
+    nowhere, or hardly anywhere, is it taken anew, to see whether that is the end."""
     residuals, jacobian, damping, fresh = problem.residuals(picture, numbers), problem.jacobian(numbers), _DAMPING, True
     for left in reversed(range(_STEPS)):
         both = np.hstack([jacobian, problem.by_gains(picture, numbers)])
