@@ -36,7 +36,7 @@ def planned(settings: Settings, dataset: Dataset) -> Settings:
         most = int(max(_SURFELS, _A_MINUTE * minutes, min(limit, shown)))
     if first is None:
         first = min(max(_FIRST, most * 3 // 4 if bare else most // 2), most)
-    stages = settings.stages or _stages(np.prod(dataset.train[0].camera.size))
+    stages = settings.stages or _stages(int(np.prod(dataset.train[0].camera.size)))
     return replace(
         settings,
         density=replace(density, max_surfels=most),

@@ -70,12 +70,12 @@ def above(distance):
     return [Camera.look_at(distance * a, (0, 0, 0), (0, 0, 1), 40, (SIZE, SIZE)) for a in away]
 
 
-def photographs(shapes, distance=2.2):
-    """`View` objects of Mitsuba ``shapes``, without light that is reflected twice."""
+def photographs(shapes, cameras=None):
+    """`View` objects of Mitsuba ``shapes``, without light that is reflected twice; None: from `above`."""
     integrator = {"type": "path", "max_depth": 2, "hide_emitters": "light" in shapes}
     scene = mi.load_dict({"type": "scene", "integrator": integrator, **shapes})
     views = []
-    for i, camera in enumerate(above(distance)):
+    for i, camera in enumerate(cameras or above(2.2)):
         sensor = camera.to_sensor_dict()
         sensor["film"] |= {"pixel_format": "rgba"}
         image = np.array(mi.render(scene, sensor=mi.load_dict(sensor), spp=16, seed=i))
@@ -91,6 +91,13 @@ def photographs(shapes, distance=2.2):
             )
         )
     return views
+
+
+def unmasked(views, noise=0.0):
+    """``views`` without their masks, and with ``noise`` of this standard deviation, in grey levels."""
+    rng, opaque = np.random.default_rng(0), np.uint8([0, 0, 0, 255])
+    noisy = lambda pixels: np.uint8(np.clip(pixels + rng.normal(size=pixels.shape) * noise, 0, 255) + 0.5)
+    return [View(v.name, v.camera, noisy(v.pixels) | opaque, False, None, None) for v in views]
 
 
 def in_cavity(x, y, z):
@@ -117,8 +124,8 @@ def test_a_tray_gets_its_inside():
 
 
 def test_without_masks_points_lie_on_surfaces_too():
-    bare = [View(v.name, v.camera, v.pixels | np.uint8([0, 0, 0, 255]), False, None, None) for v in textured_tray()]
-    points, normals = oriented_points(stereo.verified(stereo.depth_maps(bare)), 3000, np.random.default_rng(0))
+    maps = stereo.depth_maps(unmasked(textured_tray()))
+    points, normals = oriented_points(stereo.verified(maps), 3000, np.random.default_rng(0))
     assert len(points) > 1000
     x, y, z = points.T
     walls = [abs(abs(c) - w) < 0.04 for c in (x, y) for w in (INNER, HALF)]
@@ -128,8 +135,7 @@ def test_without_masks_points_lie_on_surfaces_too():
 
 
 def test_without_masks_walls_do_not_colour_what_they_hide():
-    bare = [View(v.name, v.camera, v.pixels | np.uint8([0, 0, 0, 255]), False, None, None) for v in textured_tray()]
-    points, _, colors, _ = initial_points(Dataset(bare, []), 4500)
+    points, _, colors, _ = initial_points(Dataset(unmasked(textured_tray()), []), 4500)
     floor = on_floor(*points.T)
     alone = photographs({"floor": tray(0.25)["floor"]})[0]
     column, row = alone.camera.project(points[floor])[0].astype(int).T
@@ -140,17 +146,12 @@ def test_without_masks_walls_do_not_colour_what_they_hide():
 
 def test_without_masks_faint_texture_has_depth_finer_than_levels():
     """A papered wall in noisy photographs, from directions so far apart that what is alike lies between two levels."""
-    size, border, rng = 256, 20, np.random.default_rng(0)
-    scene = {"type": "scene", "integrator": {"type": "path", "max_depth": 2}}
-    scene = mi.load_dict(scene | {"wall": panel([0, 0, 0], [2, 0, 0], [0, 2, 0], 0.05, 0, 512, 1)})
-    views = []
+    border, cameras = 20, []
     for k, angle in enumerate(np.linspace(0, 2 * np.pi, 10, endpoint=False)):
         beside = (0.7, 1.0)[k % 2] * np.array([np.cos(angle), np.sin(angle)])
-        camera = Camera.look_at((*beside, 2.2), (0, 0, 0), (0, 1, 0), 40, (size, size))
-        image = np.array(mi.render(scene, sensor=mi.load_dict(camera.to_sensor_dict()), spp=16, seed=k))[..., :3]
-        image = np.clip(image + rng.normal(scale=0.01, size=image.shape), 0, 1)
-        pixels = np.uint8(255 * np.concatenate([image, np.ones((size, size, 1))], -1) + 0.5)
-        views.append(View(str(k), camera, pixels, False, None, None))
+        cameras.append(Camera.look_at((*beside, 2.2), (0, 0, 0), (0, 1, 0), 40, (2 * SIZE, 2 * SIZE)))
+    wall = {"wall": panel([0, 0, 0], [2, 0, 0], [0, 2, 0], 0.05, 0, 512, 1)}
+    views = unmasked(photographs(wall, cameras), noise=2.5)
     known, errors = [], []
     for m in stereo.verified(stereo.depth_maps(views)):
         part = np.s_[border:-border, border:-border]
