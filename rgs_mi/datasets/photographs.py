@@ -14,7 +14,7 @@ from ..core.color import display
 from .images import resize
 from .types import DepthPrior, View
 
-MOST_PIXELS = 640_000  # that a step looks at: of larger windows one tile at a time, so that its memory is bounded
+MOST_PIXELS = 320_000  # that a step looks at: of larger windows one tile at a time, for more steps and less memory
 _CROP_MARGIN = 8  # pixels of background around the object that training looks at
 
 

@@ -290,7 +290,6 @@ class Fit:
         if (budget := self.schedule.surfel_budget(self.progress)) is not None:
             self.proxies = None
         self.density.refine(self.model, np.random.default_rng((self.settings.seed, self.step_number)), budget)
-        dr.flush_malloc_cache()  # of arrays of as many surfels as there were
 
     # ---- Pictures ----
 

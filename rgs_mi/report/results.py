@@ -48,6 +48,7 @@ def write(fit: "Fit", scene: "FitScene", folder: Path, quiet: bool) -> None:
     Raises: UserError where the disk is full or the folder can't be written.
     """
     facts = _facts(fit)  # the peak of memory is the fit's, not that of its evaluation
+    fit.photographs = None  # no step comes any more
     dr.flush_malloc_cache()
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
@@ -98,17 +99,17 @@ def measure(
     on_sheet = {view.name for view in preview_views(views)}
     with Progress(None, quiet, "evaluating") as progress:
         for k, view in enumerate(views):
-            seen = found[view.name] = Registered(view.camera)
+            seen, unaligned = Registered(view.camera), {}
             if registration is not None:
                 start = registration.cameras.get(view.name, view.camera)
-                unaligned = evaluate.render_view(surfels, lighting, start, background, spp)
-                seen = found[view.name] = register(registration, surfels, lighting, view, background)
+                image = evaluate.render_view(surfels, lighting, start, background, spp).image
+                unaligned = {UNALIGNED: metrics.psnr(image, evaluate.ground_truth(view, background))}
+                seen = register(registration, surfels, lighting, view, background)
+            found[view.name] = seen
             rendering = evaluate.render_view(surfels, lighting, seen.camera, background, spp, seen.gain)
             pictures.write_view(folder / "test", view, rendering, background, gbuffer=view.name in on_sheet)
             dr.flush_malloc_cache()  # LPIPS needs as much
-            scores[view.name] = evaluate.score(view, rendering, background)
-            if registration is not None:
-                scores[view.name][UNALIGNED] = metrics.psnr(unaligned.image, evaluate.ground_truth(view, background))
+            scores[view.name] = evaluate.score(view, rendering, background) | unaligned
             if view.name in on_sheet:
                 rows[view.name] = pictures.panels(view, rendering, background)
             progress.update((k + 1) / len(views))
