@@ -32,6 +32,13 @@ what a principled BSDF with the G-buffer's material reflects of the environment 
    - Six numbers, lower and upper corner: only what lies in this box reflects light, and is met by reflected rays. What lies
      beyond, the surroundings in a capture without masks, has its diffuse radiance alone (Default: none, everything)
 
+ * - turntable
+   - |string|
+   - The axis of a turntable on which the object turns under lamps that stand still: six numbers, x, y, z of its direction and
+     of a point on it. The environment is as a sensor at azimuth 0 sees it, and goes about the axis with the sensor; two more
+     numbers for each ring of sensors, its elevation and how much farther its lamps are turned, in degrees, say where it was not
+     the object alone that turned (Default: none, the light stands still)
+
  * - shader
    - |string|
    - What a pixel makes of the specular radiance: the weights of a tiny network, an ``.npz`` that a fit with
@@ -78,7 +85,7 @@ from rgs_mi.shading.monte_carlo import SAMPLES
 from rgs_mi.shading.shader import Shader
 from rgs_mi.surfels.surfels import Surfels
 
-from .surfels import box_of, resolve, surfels_in
+from .surfels import box_of, resolve, surfels_in, turntable_of
 
 AOVS = {
     "depth": "T",
@@ -109,7 +116,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         if self.samples < 1:
             raise UserError(f"rgs_deferred: samples is {self.samples}: needs at least 1")
         self.indirect = _choice(props, "indirect", "none", indirect.KINDS)
-        self.box = box_of(props)
+        self.box, self.turntable = box_of(props), turntable_of(props)
         self.shader_file = resolve(props.get("shader", ""))
         self.shader = Shader.load(self.shader_file) if self.shader_file else None
         self.aovs = _aovs(props.get("aovs", ""))
@@ -191,6 +198,8 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         rays = pixel_directions(camera, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]))
         color, alpha = image.color, maps.alpha
         if not self.hide_emitters and environment is not None:
+            if self.turntable is not None:
+                environment = environment.turned(self.turntable.to_lamps(camera))
             color, alpha = color + (1 - alpha) * environment.eval(rays), mi.Float(1)
         values = [*color, *([alpha] if has_alpha else []), mi.Float(1)]
         for kind in self.aovs.values():
@@ -199,7 +208,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
 
     def shading(self, eta: float) -> Shading:
         """Return how this integrator shades surfels of the index of refraction ``eta``."""
-        return Shading(self.specular, self.diffuse, self.samples, eta, self.box, self.indirect)
+        return Shading(self.specular, self.diffuse, self.samples, eta, self.box, self.indirect, self.turntable)
 
     def lighting(
         self,

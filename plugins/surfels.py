@@ -48,6 +48,7 @@ import mitsuba as mi
 
 from rgs_mi.core.bounding_box import BoundingBox
 from rgs_mi.core.errors import UserError
+from rgs_mi.core.turntable import Turntable
 from rgs_mi.shading.split_sum import DEFAULT_ETA
 from rgs_mi.surfels.ply import read_ply
 from rgs_mi.surfels.proxies import corners, quads
@@ -173,6 +174,15 @@ def box_of(props: "mi.Properties") -> BoundingBox | None:
         return BoundingBox.of(text.replace(",", " ").split()) if text else None
     except ValueError as error:
         raise UserError(f"box '{text}': {error}") from error
+
+
+def turntable_of(props: "mi.Properties") -> Turntable | None:
+    """Return the property ``turntable`` of an integrator, None where it has none. Raises: UserError for a bad one."""
+    text = props.get("turntable", "")
+    try:
+        return Turntable.of(text.replace(",", " ").split()) if text else None
+    except ValueError as error:
+        raise UserError(f"turntable '{text}': {error}") from error
 
 
 def resolve(path: str) -> str:

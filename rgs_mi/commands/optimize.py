@@ -17,7 +17,7 @@ from ..core.interrupt import GracefulInterrupt
 from ..core.progress import Progress
 from ..core.runtime import cache_folder
 from ..datasets.types import Dataset
-from ..fit import checkpoint
+from ..fit import checkpoint, light
 from ..fit.events import Events
 from ..fit.model import Model
 from ..fit.plan import planned, told
@@ -104,7 +104,9 @@ def _saved(folder, resume):
 
 def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = True) -> Fit:
     """Return the fit of a ``scene`` to the photographs of ``dataset``, at its beginning."""
-    settings = planned(settings, dataset)
+    settings, seen = light.decided(planned(settings, dataset), dataset)
+    if seen and not quiet:
+        print(seen)
     begin = settings.initialization
     assert begin.surfels, "`planned` gives them"
     points = initial_points(dataset, begin.surfels, settings.seed, begin.hull, begin.compare, quiet)
@@ -113,30 +115,35 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
     if settings.box is None and not any(view.masked for view in dataset.train):
         box = BoundingBox.seen_by([view.camera for view in dataset.train], None if random else points[0])
         settings = replace(settings, box=(*box.min, *box.max))
-    shading = _shading(scene, settings)
-    if shading.box is None:
+    box = _box(settings)
+    if box is None:
         extent = float(np.linalg.norm(points[0] - points[0].mean(0), axis=1).max())
     else:
-        extent = shading.box.radius
+        extent = box.radius
         points = _with_surroundings(points, dataset, settings)
-    light = scene.environment
-    positions, normals, colors, spacing = points
-    model = Model.start(
-        positions,
-        normals,
-        colors,
-        spacing,
-        light.texels.numpy(),
-        light.rotation,
-        settings.sh_order,
-        settings.seed,
-        begin.scale,
-        opacity,
-        begin.roughness,
-        settings.shader,
-        two_sided=None if shading.box is None else True,
-    )
-    return Fit(dataset, model, settings, extent, shading, _priors(dataset, settings))
+
+    def fit_of(dataset, settings):
+        positions, normals, colors, spacing = points
+        model = Model.start(
+            positions,
+            normals,
+            colors,
+            spacing,
+            scene.environment.texels.numpy(),
+            scene.environment.rotation,
+            settings.sh_order,
+            settings.seed,
+            begin.scale,
+            opacity,
+            begin.roughness,
+            settings.shader,
+            two_sided=None if box is None else True,
+        )
+        return Fit(dataset, model, settings, extent, _shading(scene, settings, dataset), _priors(dataset, settings))
+
+    if settings.light == "auto":
+        settings = light.tried(fit_of, dataset, settings, quiet)
+    return fit_of(dataset, settings)
 
 
 def _with_surroundings(points, dataset, settings):
@@ -149,13 +156,18 @@ def _with_surroundings(points, dataset, settings):
     return tuple(np.concatenate(pair) for pair in zip(near, far))
 
 
-def _shading(scene, settings):
-    """How the scene is shaded: in the box around the object where there is one.
+def _shading(scene, settings, dataset):
+    """How the scene is shaded: in the box around the object where there is one, on a turntable where it is on one.
 
-    Raises: UserError for a box that is none.
+    Raises: UserError for a box that is none, and for cameras that see no turntable.
     """
+    return replace(scene.shading, box=_box(settings), turntable=light.turntable_of(settings, dataset))
+
+
+def _box(settings):
+    """The box around the object, or None. Raises: UserError for one that is none."""
     try:
-        return replace(scene.shading, box=None if settings.box is None else BoundingBox.of(settings.box))
+        return None if settings.box is None else BoundingBox.of(settings.box)
     except ValueError as error:
         raise UserError(f"settings: box {settings.box}: {error}") from error
 
@@ -173,6 +185,8 @@ def _resume(saved, scene, dataset, settings) -> Fit:
     settings = planned(settings, dataset)
     if settings.box is None and (box := meta["settings"].get("box")):
         settings = replace(settings, box=tuple(box))
+    if settings.light == "auto":
+        settings = replace(settings, light=meta["settings"].get("light", "world"))
     if meta["photographs"] != _photographs(dataset):
         raise UserError(f"{dataset.root}: not the photographs of the checkpoint: give its --data, or another --out")
     old, new = _flat(meta["settings"]), _flat(to_dict(settings))
@@ -182,7 +196,8 @@ def _resume(saved, scene, dataset, settings) -> Fit:
     if changed:
         listing = ", ".join(f"{key} {old.get(key)} -> {new[key]}" for key in changed)
         print(f"settings differ from the checkpoint's, the new ones hold: {listing}", file=sys.stderr)
-    return Fit.resume(dataset, settings, arrays, meta, shading=_shading(scene, settings), priors=_priors(dataset, settings))
+    shading, priors = _shading(scene, settings, dataset), _priors(dataset, settings)
+    return Fit.resume(dataset, settings, arrays, meta, shading=shading, priors=priors)
 
 
 def _photographs(dataset) -> list:

@@ -57,6 +57,7 @@ def export(
             "indirect": shading.indirect,
             "shader": SHADER if shader else None,
             "box": shading.box,
+            "turntable": shading.turntable,
         },
     )
     if any(abs(v.camera.focal[0] / v.camera.focal[1] - 1) > _SQUARE for v in views):

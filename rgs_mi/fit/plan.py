@@ -54,6 +54,7 @@ def told(settings: Settings, dataset: Dataset) -> str:
     chosen = {
         "cameras": settings.cameras,
         "exposure": settings.exposure,
+        "light": settings.light,
         "density.max_surfels": settings.density.max_surfels,
     } | ({} if settings.box is None else {"box": "[" + ", ".join(f"{v:.3g}" for v in settings.box) + "]"})
     return (
@@ -65,9 +66,15 @@ def told(settings: Settings, dataset: Dataset) -> str:
 
 def agree(asked: Mapping, saved: Mapping) -> bool:
     """Return whether the settings ``saved`` with a fit, nested dicts, are those ``asked`` for, but for what they leave open."""
-    open_ = lambda tree: (tree["density"]["max_surfels"], tree["initialization"]["surfels"], tree["stages"], tree["box"])
+    open_ = lambda tree: (
+        tree["density"]["max_surfels"],
+        tree["initialization"]["surfels"],
+        tree["stages"],
+        tree["box"],
+        tree["light"],
+    )
     try:
-        chosen = [there if own is None else own for own, there in zip(open_(asked), open_(saved))]
+        chosen = [there if own in (None, "auto") else own for own, there in zip(open_(asked), open_(saved))]
     except (KeyError, TypeError):
         return False
     return saved == {
@@ -76,6 +83,7 @@ def agree(asked: Mapping, saved: Mapping) -> bool:
         "initialization": {**asked["initialization"], "surfels": chosen[1]},
         "stages": chosen[2],
         "box": chosen[3],
+        "light": chosen[4],
     }
 
 

@@ -258,6 +258,11 @@ class Settings:
     sh_start: float = Field(
         default=0.4, ge=0, le=1, description="Fraction of the fit from which view-dependent diffuse is learned."
     )
+    light: Literal["auto", "world", "turntable"] = Field(
+        default="auto",
+        description="Whether the light stands still to the object, or to a camera that goes round it, as on a turntable, where "
+        "it is the object that turns. Unless told, poses, backgrounds and, where these leave it open, two short fits decide.",
+    )
     cameras: Literal["fixed", "learned"] = Field(
         default="fixed",
         description="Whether poses, focal lengths, principal points and distortion are learned.",

@@ -60,7 +60,7 @@ def _reflected(gbuffer, camera, lighting):
     if lighting.lit:
         diffuse = dr.select(shaded, 0, diffuse)
     if dr.width(index) > 0:
-        m = gbuffer.maps(index)
+        m, lighting = gbuffer.maps(index), lighting.seen_by(camera, dr.width(index))
         mean = dr.rcp(m.alpha)
         normal, direction = dr.normalize(m.normal), pixel_directions(camera, index)
         point = None if lighting.indirect is None else _points(camera, direction, m.depth * mean)

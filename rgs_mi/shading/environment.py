@@ -5,7 +5,7 @@ A direction d in the emitter's frame has longitude atan2(d_x, −d_z) and colati
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -27,10 +27,13 @@ class Environment:
 
     texels    [rows, columns, 3], linear radiance (scale included), without the emitter's halo columns
     rotation  [3, 3] emitter frame to world frame
+    turn      rotation of world-space directions that comes before, of a light that stands elsewhere than in that frame by now
+              (see `Turntable.to_lamps`; None: none)
     """
 
     texels: "mi.TensorXf"
     rotation: np.ndarray
+    turn: "mi.Matrix3f | None" = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -56,8 +59,8 @@ class Environment:
 
     def to_local(self, d: "mi.Vector3f") -> "mi.Vector3f":
         """Turn world-space directions into the emitter's frame."""
-        inverse = np.linalg.inv(self.rotation)
-        return mi.Matrix3f([[dr.opaque(mi.Float, float(v)) for v in row] for row in inverse]) @ d
+        to_local = [[dr.opaque(mi.Float, float(v)) for v in row] for row in np.linalg.inv(self.rotation)]
+        return mi.Matrix3f(to_local) @ (d if self.turn is None else self.turn @ d)
 
     def filtered(self) -> "FilteredEnvironment":
         """Return the environment convolved with the BSDF's lobe at every level of roughness (docs/method.md §3)."""
@@ -97,6 +100,10 @@ class FilteredEnvironment:
     texels: "mi.Float"
     operator: _prefilter.Prefilter
     environment: Environment
+
+    def turned(self, turn: "mi.Matrix3f") -> "FilteredEnvironment":
+        """Return the same environment with `Environment.turn`."""
+        return replace(self, environment=replace(self.environment, turn=turn))
 
     def _level(self, longitude, colatitude, level):
         """Bilinear lookup in the map ``level`` (``mi.UInt32``); longitude and colatitude in [0, 1]."""

@@ -12,7 +12,8 @@ the others let through, or send in its place:
     a = ∫ L_s(ω) max(0, n·ω) dω / ∫ L(ω) max(0, n·ω) dω                                                              (9)
 
 by rays that start from its center, one number per channel. It is splatted as a radiance is, and a pixel's lit diffuse radiance
-multiplied by it. Both integrals take the same rays, so that a is 1, free of noise, wherever nothing is met.
+multiplied by it. Both integrals take the same rays, so that a is 1, free of noise, wherever nothing is met. On a turntable they
+are means over a whole turn of the light.
 """
 
 from dataclasses import dataclass, replace
@@ -94,6 +95,7 @@ class Indirect:
         normal, point = at(normal), at(self.surfels.column(mi.Vector3f, "centers"))
         local = mi.warp.square_to_cosine_hemisphere(points(n, seed, surfel, sample)[0])
         direction = mi.Frame3f(normal).to_world(local)
+        lighting = lighting.turned(dr.two_pi * (mi.Float(sample) + 0.5) / _RAYS)
         radiance = lighting.estimator.environment.eval(direction, mi.Float(_BLUR))
         coming = self.incident_radiance(radiance, point, normal, direction, lighting)
         total = lambda color: mi.Color3f(*(dr.block_sum(c, _RAYS) for c in color))

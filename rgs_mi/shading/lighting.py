@@ -7,6 +7,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.bounding_box import BoundingBox
+from ..core.camera import Camera
+from ..core.turntable import Turntable
 from ..splat.gbuffer import Maps
 from ..surfels.proxies import Proxies
 from ..surfels.surfels import Surfels
@@ -25,7 +27,8 @@ _NARROW, _WIDE = 0.2, 0.4
 @dataclass(frozen=True)
 class Shading:
     """How a scene is shaded, as the parameters of its integrator `rgs_deferred` say; ``eta`` is the surfels' index of
-    refraction, and ``box`` says where all this holds (None: everywhere)."""
+    refraction, ``box`` says where all this holds (None: everywhere), and ``turntable`` on which the object turns under its light
+    (None: it stands still)."""
 
     specular: Literal["none", "split_sum", "monte_carlo"] = "split_sum"
     diffuse: Literal["radiance", "lit"] = "radiance"
@@ -33,6 +36,7 @@ class Shading:
     eta: float = DEFAULT_ETA
     box: BoundingBox | None = None
     indirect: Literal["none", "visibility", "one_bounce"] = "none"
+    turntable: Turntable | None = None
 
 
 @dataclass
@@ -44,6 +48,8 @@ class Lighting:
     indirect   says how surfels reflect each other (None: they do not)
     lit        whether their diffuse radiance, too, is that of their base colour under the light, and not their own
     box        where all this holds (None: everywhere); beyond it they have their own diffuse radiance alone
+    turntable  on which they turn under the light, so that it depends on the camera how that stands to them (None: it does not)
+    turn       of the turntable's ring that the camera is in, radians, in place of its own (None: its own)
     """
 
     estimator: SplitSum | MonteCarlo
@@ -51,6 +57,22 @@ class Lighting:
     indirect: Indirect | None = None
     lit: bool = False
     box: BoundingBox | None = None
+    turntable: Turntable | None = None
+    turn: "mi.Float | None" = None
+
+    def seen_by(self, camera: Camera, width: int) -> "Lighting":
+        """Return the lighting as it stands to the surfels when ``camera`` sees them, for a kernel of this ``width``; see
+        `Turntable.to_lamps`."""
+        if self.turntable is None:
+            return self
+        return self._turned(self.turntable.to_lamps(camera, width, self.turn))
+
+    def _turned(self, turn):
+        return replace(self, estimator=self.estimator.turned(turn))
+
+    def turned(self, angle: "mi.Float") -> "Lighting":
+        """Return the lighting as it stands to the surfels for cameras at azimuths ``angle``, radians; see `Turntable.turned`."""
+        return self if self.turntable is None else self._turned(self.turntable.turned(angle))
 
     def specular(self, surface: Surface, point: "mi.Point3f | None" = None) -> "mi.Color3f":
         """Return f_φ(C_s), linear radiance that a `Surface` reflects towards its ``view``; see `SplitSum.specular`. `indirect`
@@ -152,7 +174,7 @@ def lighting_of(
     if shading.indirect != "none":
         proxies = Proxies(surfels, box=shading.box) if proxies is None else proxies
         indirect = Indirect(shading.indirect, proxies, surfels, irradiance_visibility)
-    lighting = Lighting(estimator, shader, indirect, lit, shading.box)
+    lighting = Lighting(estimator, shader, indirect, lit, shading.box, shading.turntable)
     # Where the light is sampled, its rays say by themselves what is hidden
     needs_visibility = lit and indirect is not None and not sampled and irradiance_visibility is None
     return lighting.with_irradiance_visibility(seed) if needs_visibility else lighting

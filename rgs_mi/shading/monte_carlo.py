@@ -71,6 +71,10 @@ class MonteCarlo:
         """Return the same estimator with other ``texels`` of its `FilteredEnvironment`."""
         return replace(self, environment=replace(self.environment, texels=texels))
 
+    def turned(self, turn: "mi.Matrix3f") -> "MonteCarlo":
+        """Return the same estimator under a light that is turned (`Environment.turn`)."""
+        return replace(self, environment=self.environment.turned(turn))
+
     def _integral(self, lobe, surface, incident_radiance):
         if self.paired:
             derivatives = replace(self, paired=False)._integral(lobe, surface, incident_radiance)
@@ -94,7 +98,9 @@ class MonteCarlo:
         material = lobe(roughness, metallic, base_color, self.eta)
         si = _interaction(normal, view)
         of_light, of_lobe = points(n, self.seed, pixel, sample, sets=2)
-        lit = self.emitter.sample_direction(si, of_light)[0].d
+        lit, turn = self.emitter.sample_direction(si, of_light)[0].d, self.environment.environment.turn
+        if turn is not None:
+            lit = turn.T @ lit
         bounced = si.to_world(material.sample(si, mi.Float(0.5), of_lobe))
         total = mi.Color3f(0)
         for direction in (dr.detach(lit), bounced):
@@ -110,7 +116,8 @@ class MonteCarlo:
 
     def _emitter_pdf(self, si, direction):
         ds = dr.zeros(mi.DirectionSample3f, dr.width(direction))
-        ds.d = direction
+        turn = self.environment.environment.turn
+        ds.d = direction if turn is None else turn @ direction
         return self.emitter.pdf_direction(si, ds)
 
 
