@@ -122,7 +122,7 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
         extent = box.radius
         points = _with_surroundings(points, dataset, settings)
 
-    def fit_of(dataset, settings):
+    def fit_of(shown, settings):
         positions, normals, colors, spacing = points
         model = Model.start(
             positions,
@@ -139,10 +139,11 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
             settings.shader,
             two_sided=None if box is None else True,
         )
-        return Fit(dataset, model, settings, extent, _shading(scene, settings, dataset), _priors(dataset, settings))
+        return Fit(shown, model, settings, extent, _shading(scene, settings, dataset), _priors(shown, settings))
 
     if settings.light == "auto":
         settings = light.tried(fit_of, dataset, settings, quiet)
+    settings = light.ring_turns(fit_of, dataset, settings, quiet)
     return fit_of(dataset, settings)
 
 
@@ -187,6 +188,8 @@ def _resume(saved, scene, dataset, settings) -> Fit:
         settings = replace(settings, box=tuple(box))
     if settings.light == "auto":
         settings = replace(settings, light=meta["settings"].get("light", "world"))
+    if settings.turns is None and (turns := meta["settings"].get("turns")):
+        settings = replace(settings, turns=tuple(turns))
     if meta["photographs"] != _photographs(dataset):
         raise UserError(f"{dataset.root}: not the photographs of the checkpoint: give its --data, or another --out")
     old, new = _flat(meta["settings"]), _flat(to_dict(settings))

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from ..core.errors import UserError
@@ -20,12 +21,13 @@ from .trainer import Fit
 
 _STEPS, _HELD_OUT = 400, 8  # of each of two fits that are compared; every so many photographs judge them
 _CLEAR = 0.3  # dB between them that tell
+_SHOWN, _COARSE, _FINE = 4, 10, 2  # photographs that tell how a ring's lamps are turned; degrees from one turn to the next
 
 
 def turntable_of(settings: Settings, dataset: Dataset) -> Turntable | None:
     """Return the turntable on which the object of ``dataset`` turns; None where ``settings`` say that the light is the world's.
 
-    Raises: UserError where they say turntable, and cameras do not stand on rings about one axis.
+    Raises: UserError where they say turntable, and cameras do not stand on rings about one axis, or on others than have turns.
     """
     if settings.light != "turntable":
         return None
@@ -34,7 +36,12 @@ def turntable_of(settings: Settings, dataset: Dataset) -> Turntable | None:
         raise UserError(
             f"{dataset.root}: its cameras do not stand on rings about one axis, as a turntable's do: light=world"
         )
-    return table
+    if settings.turns is None:
+        return table
+    if len(settings.turns) != len(table.rings):
+        heights = ", ".join(f"{elevation:.0f}" for elevation, _ in table.rings)
+        raise UserError(f"settings: turns has {len(settings.turns)} numbers: give one for each ring, at {heights} degrees")
+    return replace(table, rings=tuple((elevation, turn) for (elevation, _), turn in zip(table.rings, settings.turns)))
 
 
 def decided(settings: Settings, dataset: Dataset) -> tuple[Settings, str]:
@@ -62,21 +69,12 @@ def decided(settings: Settings, dataset: Dataset) -> tuple[Settings, str]:
 def tried(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, settings: Settings, quiet: bool) -> Settings:
     """Return ``settings`` with the `light` by which a short fit, as ``fit_of`` starts one, comes nearer to photographs that are
     held out of it; 'world' where it makes no difference, of which it tells."""
-    assert settings.stages, "`plan.planned` gives them"
     held_out = dataset.train[::_HELD_OUT]
     shown = replace(dataset, train=[view for k, view in enumerate(dataset.train) if k % _HELD_OUT])
-    short = replace(
-        settings,
-        iterations=_STEPS,
-        minutes=None,
-        stages=(Stage(1.0, settings.stages[0].downscale, 1),),
-        cameras="fixed",
-        weights=replace(settings.weights, depth=0),
-    )
     scores = {}
     with Progress(quiet=quiet, label="world or turntable") as progress:
         for k, light in enumerate(("world", "turntable")):
-            fit = fit_of(shown, replace(short, light=light))
+            fit = fit_of(shown, _short(settings, light))
             while fit.progress < 1:
                 fit.step()
                 progress.update((k + fit.progress) / 2)
@@ -91,13 +89,63 @@ def tried(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, settings
     return replace(settings, light=better if clear else "world")
 
 
-def _score(fit: Fit, views: list[View]) -> float:
-    """The mean PSNR of ``views`` at the resolution of the fit."""
+def ring_turns(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, settings: Settings, quiet: bool) -> Settings:
+    """Return ``settings``, of an object on a turntable, with the `turns` of its rings' lamps: a short fit to the ring of the most
+    photographs sees some of each other ring under lamps that are turned all around; where no turn makes those clearly better,
+    there is none."""
+    table = turntable_of(settings, dataset)
+    if settings.turns is not None or table is None or len(table.rings) < 2:
+        return settings
+    ring = [table.ring(view.camera) for view in dataset.train]
+    count = len(table.rings)
+    members = [[view for view, own in zip(dataset.train, ring) if own == k] for k in range(count)]
+    first = max(range(count), key=lambda k: len(members[k]))
+    turns = [0.0] * count
+    with Progress(quiet=quiet, label="lamps of the rings") as progress:
+        fit = fit_of(replace(dataset, train=members[first]), _short(settings, "turntable"))
+        while fit.progress < 1:
+            fit.step()
+            progress.update(0.8 * fit.progress)
+        others = [k for k in range(count) if k != first]
+        for done, k in enumerate(others):
+            few = members[k][:: max(1, len(members[k]) // _SHOWN)]
+            score = lambda turn: _score(fit, few, np.radians(turn))
+            best = max(np.arange(-180, 180, _COARSE), key=score)
+            best = max(best + np.arange(-_COARSE, _COARSE + 1, _FINE), key=score)
+            turns[k] = float(best) if score(best) > score(0) + _CLEAR else 0.0
+            progress.update(0.8 + 0.2 * (done + 1) / len(others))
+    dr.flush_malloc_cache()
+    if any(turns) and not quiet:
+        listing = ", ".join(f"{turn:+.0f}" for turn in turns)
+        print(f"the camera was moved among the lamps: rings, from the lowest, see them turned by {listing} degrees")
+    return replace(settings, turns=tuple(turn - turns[0] for turn in turns))
+
+
+def _short(settings, light):
+    """Settings of a fit that is to tell which light it is."""
+    assert settings.stages, "`plan.planned` gives them"
+    return replace(
+        settings,
+        iterations=_STEPS,
+        minutes=None,
+        stages=(Stage(1.0, settings.stages[0].downscale, 1),),
+        cameras="fixed",
+        weights=replace(settings.weights, depth=0),
+        light=light,
+        turns=None,
+    )
+
+
+def _score(fit: Fit, views: list[View], turn: float | None = None) -> float:
+    """The mean PSNR of ``views`` at the resolution of the fit; ``turn`` is that of their lamps, radians (None: as it is)."""
     photographs = Photographs(views, fit.stage.downscale, fit.settings.background)
     errors = []
     with dr.suspend_grad():
         surfels = fit.model.surfels(fit.sh_order)
         lighting = fit.lighting(surfels)
+        assert lighting is not None, "something is specular"
+        if turn is not None:
+            lighting = replace(lighting, turn=dr.opaque(mi.Float, float(turn)))
         for k in range(len(views)):
             photograph = photographs.tile(k)
             image = deferred.render(surfels, photograph.camera, lighting)

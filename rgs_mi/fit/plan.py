@@ -72,6 +72,7 @@ def agree(asked: Mapping, saved: Mapping) -> bool:
         tree["stages"],
         tree["box"],
         tree["light"],
+        tree["turns"],
     )
     try:
         chosen = [there if own in (None, "auto") else own for own, there in zip(open_(asked), open_(saved))]
@@ -84,6 +85,7 @@ def agree(asked: Mapping, saved: Mapping) -> bool:
         "stages": chosen[2],
         "box": chosen[3],
         "light": chosen[4],
+        "turns": chosen[5],
     }
 
 

@@ -102,6 +102,10 @@ class Schedule:
             for name in ("poses", "intrinsics", "exposure")
         }
 
+    def turn_rate(self, progress: float) -> float:
+        """Adam's rate of the turns of a turntable's rings, radians."""
+        return self.value(self.settings.learning_rates.turns, progress) * self._cooled(progress)
+
     def _cooled(self, progress):
         """The part that rates have of themselves in the end. Adam's steps are as long as its rates, however little there is to
         gain: what is right trembles to the last."""

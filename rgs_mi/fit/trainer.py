@@ -24,6 +24,7 @@ from .model import ENVIRONMENT, Model
 from .objective import CUTOFFS, Objective
 from .plan import LAST, LEAST_STEPS, STEPS
 from .schedule import Schedule
+from .turns import Turns
 
 _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
 _PACE = 31  # steps whose median says how long one takes
@@ -52,8 +53,8 @@ class Fit:
 
     ``extent``: radius of the object in world units. ``shading``: how the scene is shaded. ``priors``: a `DepthPrior` for
     each training view, or None. ``elapsed``: seconds spent so far, earlier sessions included; ``psnr``: of the last step's
-    views, NaN once the fit has diverged; ``cameras``: what is learned of cameras and exposures, or None; ``curves``: what its
-    steps measured.
+    views, NaN once the fit has diverged; ``cameras``: what is learned of cameras and exposures, or None; ``turns``: what is
+    learned of a turntable's lamps, or None; ``curves``: what its steps measured.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class Fit:
         self.objective = Objective(settings, extent, shading.box)
         self.density = DensityControl(settings.density, extent, shading.box, len(model))
         self.cameras = Cameras.of(dataset, settings, extent)
+        self.turns = Turns.of(shading.turntable)
         self.curves = Curves()
         self.photographs: Photographs | None = None  # of the stage that has begun
         self.step_number, self.views_used, self.elapsed = 0, 0, 0.0
@@ -88,8 +90,8 @@ class Fit:
         arrays = {"gradient_sum": gradients.sum.numpy(), "gradient_count": gradients.count.numpy()}
         meta = {"step": self.step_number, "views_used": self.views_used, "elapsed": self.elapsed, "extent": self.extent}
         meta["level"] = self._level and self._level.meta()
-        if self.cameras:
-            arrays |= self.cameras.state()
+        for learned in (self.cameras, self.turns):
+            arrays |= learned.state() if learned else {}
         return self.model.state() | arrays, meta | {"curves": self.curves.rows}
 
     @classmethod
@@ -99,8 +101,9 @@ class Fit:
         fit.step_number, fit.views_used, fit.elapsed = meta["step"], meta["views_used"], meta["elapsed"]
         gradients = fit.density.gradients
         gradients.sum, gradients.count = (as_float(arrays[f"gradient_{k}"]) for k in ("sum", "count"))
-        if fit.cameras:
-            fit.cameras.restore(arrays)
+        for learned in (fit.cameras, fit.turns):
+            if learned:
+                learned.restore(arrays)
         fit.curves = Curves(meta["curves"])
         if level := meta["level"]:
             stage = next((s for s in settings.stages or () if s.downscale == level["downscale"]), None)
@@ -144,7 +147,8 @@ class Fit:
     @property
     def shading(self) -> Shading:
         """How the model is shaded by now: that of a scene that renders the same."""
-        return self.schedule.shading(self.progress)
+        shading = self.schedule.shading(self.progress)
+        return replace(shading, turntable=self.turns.table) if self.turns else shading
 
     # ---- Lighting ----
 
@@ -207,6 +211,8 @@ class Fit:
         self.model.optimizer.step()
         if self.cameras:
             self.cameras.step(self.schedule.camera_rates(progress, stage.downscale * self.cameras.pixel))
+        if self.turns:
+            self.turns.step(self.schedule.turn_rate(progress))
         dr.eval(measured)
         mean = {name: np.mean([float(m[name][0]) for m in measured if name in m]) for m in measured for name in m}
         self._judge(mean.pop("error"))
@@ -262,6 +268,8 @@ class Fit:
             started = self.schedule.learns_cameras(self.progress)
             seen = self.cameras.see(i, photo.camera, self.settings.weights, started)
             photo, gain, terms = replace(photo, camera=seen.camera), seen.gain, {"loss.cameras": seen.prior}
+        if self.turns and lighting:
+            lighting = replace(lighting, turn=self.turns.see(photo.camera))
         means2d_offset = dr.zeros(mi.Vector2f, len(self.model))
         dr.enable_grad(means2d_offset)
         image = deferred.render(surfels, photo.camera, lighting, means2d_offset, CUTOFFS, self.objective.full)

@@ -87,6 +87,9 @@ class LearningRates:
         default=(5e-5, 5e-6),
         description="Of focal lengths, principal points and distortion, relative to the picture's size.",
     )
+    turns: Rates = Field(
+        default=(5e-3, 2e-4), description="Of how far the lamps of a turntable's rings of cameras are turned, radians."
+    )
     exposure: Rates = Field(default=(5e-2, 1e-3), description="Of the photographs' exposure, natural logarithms of gains.")
 
 
@@ -262,6 +265,11 @@ class Settings:
         default="auto",
         description="Whether the light stands still to the object, or to a camera that goes round it, as on a turntable, where "
         "it is the object that turns. Unless told, poses, backgrounds and, where these leave it open, two short fits decide.",
+    )
+    turns: tuple[float, ...] | None = Field(
+        default=None,
+        description="Degrees by which the lamps of each ring of cameras around a turntable, lowest first, are turned, because "
+        "someone has moved the camera among them. Unless given, a short fit to the largest ring tells; then they are learned.",
     )
     cameras: Literal["fixed", "learned"] = Field(
         default="fixed",

@@ -1,0 +1,124 @@
+"""Whether it is the light that stands still, or the camera: told by poses, by backgrounds, by two short fits."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from rgs_mi.core.camera import Camera
+from rgs_mi.core.errors import UserError
+from rgs_mi.core.turntable import Turntable
+from rgs_mi.datasets.path_traced import train_directions
+from rgs_mi.datasets.types import Dataset, View
+from rgs_mi.fit import light, losses
+from rgs_mi.fit.trainer import Fit
+from rgs_mi.settings.settings import Settings, Stage
+from rgs_mi.shading import deferred
+from rgs_mi.shading.environment import Environment
+from rgs_mi.shading.lighting import Shading, lighting_of
+from rgs_mi.surfels.surfels import SH_0, Surfels
+
+from fits import SETTINGS, model
+from scenes import tangent_surfels
+
+ELEVATIONS, COUNT, SIZE, MOVED = (10, 40), 10, 48, 50.0
+ONE_STAGE = replace(SETTINGS, iterations=60, stages=(Stage(1.0, 1, 1),), specular_start=0.0)
+
+
+def cameras(directions=None):
+    around = 2 * np.pi * np.arange(COUNT) / COUNT
+    if directions is None:
+        directions = [
+            [np.cos(e) * np.cos(a + e), np.cos(e) * np.sin(a + e), np.sin(e)] for e in np.radians(ELEVATIONS) for a in around
+        ]
+    return [Camera.look_at(4 * np.array(d), (0, 0, 0), (0, 0, 1), 40, (SIZE, SIZE)) for d in directions]
+
+
+@cache
+def capture(turned, moved=0.0, masked=True):
+    """Photographs of a mirror ball from two rings, under lamps that stand still, or go round with the camera."""
+    surfels = tangent_surfels(600, curvature=(1, 0, 1)).numpy()
+    surfels |= {
+        "metallic": np.full((600, 1), 0.95),
+        "roughness": np.full((600, 1), 0.15),
+        "opacities": np.full((600, 1), 0.98),
+    }
+    surfels |= {"base_color": np.full((600, 3), 0.9), "sh": np.full((600, 3), -0.5 / SH_0)}
+    ball = Surfels.from_numpy(surfels, two_sided=False)
+    noise = ndimage.gaussian_filter(np.random.default_rng(1).normal(size=(32, 64, 3)), (3, 3, 0), mode="wrap")
+    lamps = Environment(
+        mi.TensorXf(np.float32(np.exp(2 * noise / noise.std()) / 3)), np.eye(3)[[0, 2, 1]] * [[1], [1], [-1]]
+    )
+    table = Turntable((0, 0, 1), (0, 0, 0), ((ELEVATIONS[0], 0.0), (ELEVATIONS[1], moved)))
+    lighting = lighting_of(Shading(turntable=table if turned else None), ball, lamps.filtered())
+    views = []
+    for k, camera in enumerate(cameras()):
+        image = deferred.render(ball, camera, lighting)
+        alpha = image.gbuffer.all.alpha
+        shown = losses.display(image.color, alpha, 0.0).numpy().T / np.maximum(alpha.numpy()[:, None], 0.05)
+        rgba = np.concatenate([shown, alpha.numpy()[:, None]], 1).reshape(SIZE, SIZE, 4)
+        views.append(View(f"{k}", camera, np.uint8(255 * np.clip(rgba, 0, 1) + 0.5), masked, None, Path(f"{k}.png")))
+    return Dataset(views, [])
+
+
+def fit_of(shown, settings, whole=None):
+    return Fit(shown, model(), settings, 1.0, Shading(turntable=light.turntable_of(settings, whole or shown)))
+
+
+def test_poses_leave_it_open_or_not():
+    settings, seen = light.decided(Settings(), capture(True))
+    assert settings.light == "auto" and "2 rings" in seen
+    lattice = [replace(v, camera=c) for v, c in zip(capture(True).train, cameras(train_directions(2 * COUNT)))]
+    assert light.decided(Settings(), Dataset(lattice, []))[0].light == "world"
+    assert light.decided(Settings(light="turntable"), capture(True)) == (Settings(light="turntable"), "")
+    assert light.decided(Settings(specular_start=1), capture(True))[0].light == "world"
+    assert light.decided(Settings(), capture(True, masked=False))[0].light == "world"
+
+
+@pytest.mark.parametrize("turned, expected", [(True, "turntable"), (False, "world")])
+def test_two_short_fits_tell(monkeypatch, capfd, turned, expected):
+    monkeypatch.setattr(light, "_STEPS", 60)
+    assert light.tried(fit_of, capture(turned), replace(ONE_STAGE, light="auto"), quiet=False).light == expected
+    assert "decides nothing" not in capfd.readouterr().err
+
+
+def test_a_difference_that_is_none_is_said(monkeypatch, capfd):
+    monkeypatch.setattr(light, "_STEPS", 1)
+    assert light.tried(fit_of, capture(True), replace(ONE_STAGE, light="auto"), quiet=False).light == "world"
+    assert "decides nothing" in capfd.readouterr().err
+
+
+def test_a_camera_that_was_moved_among_the_lamps(monkeypatch):
+    monkeypatch.setattr(light, "_STEPS", 60)
+    settings, whole = replace(ONE_STAGE, light="turntable"), capture(True, MOVED)
+    found = light.ring_turns(lambda shown, s: fit_of(shown, s, whole), whole, settings, quiet=True)
+    assert found.turns is not None and found.turns[0] == 0 and found.turns[1] == pytest.approx(MOVED, abs=6)
+    # what was given stays, and so does a camera that was not moved
+    assert light.ring_turns(fit_of, whole, replace(settings, turns=(0.0, 3.0)), quiet=True).turns == (0.0, 3.0)
+    unmoved = light.ring_turns(lambda shown, s: fit_of(shown, s, capture(True)), capture(True), settings, quiet=True)
+    assert unmoved.turns is not None and abs(unmoved.turns[1]) <= 4
+
+
+def test_turns_are_learned_and_resumed():
+    settings = replace(ONE_STAGE, light="turntable", turns=(0.0, MOVED - 8), iterations=300)
+    fit = fit_of(capture(True, MOVED), settings)
+    for _ in range(300):
+        fit.step()
+    table = fit.shading.turntable
+    assert table is not None and table.rings[0][1] == 0
+    assert abs(table.rings[1][1] - MOVED) < 4
+    again = Fit.resume(capture(True, MOVED), settings, *fit.state(), shading=fit.schedule.final)
+    assert again.shading.turntable == table
+
+
+def test_bad_settings():
+    lattice = [replace(v, camera=c) for v, c in zip(capture(True).train, cameras(train_directions(2 * COUNT)))]
+    with pytest.raises(UserError, match="do not stand on rings"):
+        light.turntable_of(Settings(light="turntable"), Dataset(lattice, []))
+    with pytest.raises(UserError, match="one for each ring, at 10, 40 degrees"):
+        light.turntable_of(Settings(light="turntable", turns=(0.0,)), capture(True))
+    assert light.turntable_of(Settings(light="world"), Dataset(lattice, [])) is None
