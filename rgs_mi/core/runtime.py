@@ -106,6 +106,16 @@ def cache_folder(kind: str = "") -> Path:
     return Path(os.environ.get(CACHE_VARIABLE) or "data") / kind
 
 
+def release_memory() -> None:
+    """Return to the system what was freed: arrays that Dr.Jit keeps for others of their size, and, where the C library can, the
+    holes in its heap, which after the start of a fit are half a gigabyte."""
+    import drjit as dr
+
+    dr.flush_malloc_cache()
+    if trim := getattr(ctypes.CDLL(None) if os.name == "posix" else None, "malloc_trim", None):
+        trim(0)
+
+
 def peak_rss_mb() -> float | None:
     """Most memory that this process has held, in MiB; None where the system does not say (Windows)."""
     try:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..core.errors import UserError
 from ..core.progress import Progress
+from ..core.runtime import release_memory
 from ..core.turntable import Turntable
 from ..datasets.photographs import Photographs
 from ..datasets.types import Dataset, View
@@ -79,7 +80,7 @@ def tried(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, settings
                 fit.step()
                 progress.update((k + fit.progress) / 2)
             scores[light] = _score(fit, held_out)
-            dr.flush_malloc_cache()
+            release_memory()
     better = max(scores, key=lambda light: scores[light])
     difference = scores["turntable"] - scores["world"]
     clear = abs(difference) >= _CLEAR
@@ -114,7 +115,7 @@ def ring_turns(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, set
             best = max(best + np.arange(-_COARSE, _COARSE + 1, _FINE), key=score)
             turns[k] = float(best) if score(best) > score(0) + _CLEAR else 0.0
             progress.update(0.8 + 0.2 * (done + 1) / len(others))
-    dr.flush_malloc_cache()
+    release_memory()
     if any(turns) and not quiet:
         listing = ", ".join(f"{turn:+.0f}" for turn in turns)
         print(f"the camera was moved among the lamps: rings, from the lowest, see them turned by {listing} degrees")

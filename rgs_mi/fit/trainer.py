@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import as_float
+from ..core.runtime import release_memory
 from ..datasets.photographs import Photographs, tiling
 from ..datasets.types import Dataset, DepthPrior
 from ..settings.settings import Settings, Stage
@@ -198,7 +199,7 @@ class Fit:
         if self.photographs is None or self.photographs.downscale != stage.downscale:
             s = self.settings
             self.photographs = Photographs(self.dataset.train, stage.downscale, s.background, self.priors, s.mask_tolerance)
-            dr.flush_malloc_cache()  # of arrays of sizes that do not come again
+            release_memory()  # of arrays of sizes that do not come again
         self._follow_schedule()
         views = self._next_views(stage.views)
         surfels = self.model.surfels(self.sh_order)

@@ -16,7 +16,7 @@ import numpy as np
 from .. import __version__, report
 from ..core.files import write_json, write_png
 from ..core.progress import Progress
-from ..core.runtime import cores, peak_rss_mb
+from ..core.runtime import cores, peak_rss_mb, release_memory
 from ..datasets.types import Dataset, View
 from ..evaluation import evaluate, lpips, metrics, pictures
 from ..evaluation.registration import Registered, Registration, register
@@ -49,7 +49,7 @@ def write(fit: "Fit", scene: "FitScene", folder: Path, quiet: bool) -> None:
     """
     facts = _facts(fit)  # the peak of memory is the fit's, not that of its evaluation
     fit.photographs = None  # no step comes any more
-    dr.flush_malloc_cache()
+    release_memory()
     with dr.suspend_grad():
         surfels, environment = fit.model.surfels(fit.sh_order), fit.model.environment()
         lighting = fit.lighting(surfels)
@@ -108,7 +108,7 @@ def measure(
             found[view.name] = seen
             rendering = evaluate.render_view(surfels, lighting, seen.camera, background, spp, seen.gain)
             pictures.write_view(folder / "test", view, rendering, background, gbuffer=view.name in on_sheet)
-            dr.flush_malloc_cache()  # LPIPS needs as much
+            release_memory()  # LPIPS needs as much
             scores[view.name] = evaluate.score(view, rendering, background) | unaligned
             if view.name in on_sheet:
                 rows[view.name] = pictures.panels(view, rendering, background)

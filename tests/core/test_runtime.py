@@ -91,3 +91,21 @@ def test_the_folder_of_caches_can_be_set(monkeypatch, tmp_path):
     assert runtime.cache_folder("priors").as_posix() == "data/priors"
     monkeypatch.setenv(runtime.CACHE_VARIABLE, str(tmp_path))
     assert runtime.cache_folder("priors") == tmp_path / "priors" and runtime.cache_folder() == tmp_path
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="needs Linux's /proc")
+def test_freed_arrays_go_back_to_the_system():
+    import drjit as dr
+    import mitsuba as mi
+
+    def resident():
+        with open("/proc/self/statm") as stream:
+            return int(stream.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+    arrays = [dr.arange(mi.Float, 1 << 22) + k for k in range(12)]  # of 17 MB
+    dr.eval(arrays)
+    dr.sync_thread()
+    before = resident()
+    del arrays
+    runtime.release_memory()
+    assert resident() < before - 150
