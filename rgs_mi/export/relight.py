@@ -9,7 +9,7 @@ import numpy as np
 
 from ..core.arrays import as_tensor
 from ..core.errors import UserError
-from ..plugins import surfels_of
+from ..plugins import is_deferred, surfels_of
 from ..targets import environments
 
 #: Materials of surfels that can be set: name -> channels.
@@ -19,7 +19,7 @@ MATERIAL = {"roughness": 1, "metallic": 1, "base_color": 3}
 def relight(scene: "mi.Scene", path: str | Path, envmap: str | Path | None = None, rotate: float = 0.0) -> None:
     """Put another ``envmap`` (an image, latitude-longitude, or the name of an environment of the suite; None: as it is) into
     the ``scene`` that was loaded from ``path``, in the place and orientation of its own, turned by ``rotate`` degrees about
-    its up axis.
+    its up axis. Another map stands still, where its own goes round with the camera, as on a turntable.
 
     Raises: UserError for a scene without an environment map, and an image that can't be read.
     """
@@ -30,6 +30,8 @@ def relight(scene: "mi.Scene", path: str | Path, envmap: str | Path | None = Non
     if envmap is not None:
         params["data"] = mi.traverse(_load(envmap))["data"]
         params["scale"] = 1.0
+        if is_deferred(integrator := scene.integrator()):
+            integrator.turntable = None
     turned = mi.ScalarTransform4f().rotate([0, 1, 0], rotate)  # an envmap's up axis is y
     params["to_world"] = mi.Transform4f(mi.ScalarTransform4f(np.array(params["to_world"].matrix).reshape(4, 4)) @ turned)
     params.update()

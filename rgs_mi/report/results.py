@@ -5,7 +5,7 @@ import platform
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -171,6 +171,7 @@ def finished(folder: Path) -> bool:
 
 def _facts(fit) -> dict:
     """What metrics.json says of the run as a whole, beside `measure`."""
+    table = fit.shading.turntable
     return {
         "finished": fit.progress >= 1,
         "train_seconds": fit.elapsed,
@@ -180,6 +181,7 @@ def _facts(fit) -> dict:
         "peak_rss_mb": peak_rss_mb(),
         "train_views": len(fit.dataset.train),
         "test_views": len(fit.dataset.test),
+        "turntable": table and asdict(table),
         "photographs": str(fit.dataset.root.resolve()),
         "settings": to_dict(fit.settings),
         **circumstances(),

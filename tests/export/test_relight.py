@@ -130,6 +130,17 @@ def test_turning_the_light_turns_the_highlight(run, tmp_path):
     assert max(brightest, key=brightest.get) == "+y"
 
 
+def test_another_light_stands_still_where_its_own_goes_round(run, tmp_path):
+    text = (run / "scene.xml").read_text()
+    path = run / "on_turntable.xml"
+    path.write_text(text.replace("</integrator>", '<string name="turntable" value="0 0 1 0 0 0"/></integrator>'))
+    before = render(load_scene(run / "scene.xml", {}))
+    scene = load_scene(path, {})
+    assert abs(render(scene) - before).mean() > 1e-3
+    relight(scene, path, run / "environment.exr")
+    assert np.allclose(render(scene), before, atol=1e-4)
+
+
 def test_edit(run):
     path = run / "scene.xml"
     scene = load_scene(path, {})

@@ -1,5 +1,6 @@
 """Whether it is the light that stands still, or the camera: told by poses, by backgrounds, by two short fits."""
 
+import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -7,13 +8,18 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
+from PIL import Image
 from scipy import ndimage
 
+from rgs_mi.commands.optimize import optimize
 from rgs_mi.core.camera import Camera
 from rgs_mi.core.errors import UserError
+from rgs_mi.core.files import write_json
+from rgs_mi.core.scene_files import find_scene, load_scene
 from rgs_mi.core.turntable import Turntable
 from rgs_mi.datasets.path_traced import train_directions
 from rgs_mi.datasets.types import Dataset, View
+from rgs_mi.export.render import straight
 from rgs_mi.fit import light, losses
 from rgs_mi.fit.trainer import Fit
 from rgs_mi.settings.settings import Settings, Stage
@@ -113,6 +119,41 @@ def test_turns_are_learned_and_resumed():
     assert abs(table.rings[1][1] - MOVED) < 4
     again = Fit.resume(capture(True, MOVED), settings, *fit.state(), shading=fit.schedule.final)
     assert again.shading.turntable == table
+
+
+def written(folder):
+    """`capture` with a camera that was moved, as files in the Blender layout; every fifth view held out."""
+    views = capture(True, MOVED).train
+    for split, chosen in {"train": [v for k, v in enumerate(views) if k % 5], "test": views[::5]}.items():
+        (folder / split).mkdir(parents=True)
+        frames = []
+        for view in chosen:
+            Image.fromarray(view.pixels).save(folder / split / f"{view.name}.png")
+            pose = (view.camera.to_world @ np.diag([1, -1, -1, 1])).tolist()
+            frames.append({"file_path": f"./{split}/{view.name}", "transform_matrix": pose})
+        write_json(folder / f"transforms_{split}.json", {"camera_angle_x": np.radians(40), "frames": frames})
+    return folder
+
+
+def test_a_run_says_that_its_object_turns(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(light, "_STEPS", 60)
+    overrides = ["iterations=60", "initialization.surfels=400", "initialization.compare=false", "spp=1"]
+    run = optimize(
+        find_scene("object", "scenes"), data=written(tmp_path / "ball"), out=tmp_path / "run", overrides=overrides
+    )
+    told = capfd.readouterr()
+    assert "2 rings about one axis" in told.out and "light=turntable" in told.out and "was moved" in told.out
+    figures = json.loads((run / "metrics.json").read_text())
+    (low, still), (high, turned) = figures["turntable"]["rings"]
+    assert (low, high) == pytest.approx(ELEVATIONS, abs=0.1) and still == 0 and turned == pytest.approx(MOVED, abs=8)
+    assert figures["settings"]["light"] == "turntable"
+    # the scene that it leaves behind knows it, too: from either height it looks as the run's own picture does
+    scene = load_scene(run / "scene.xml", {})
+    for sensor in scene.sensors()[::3]:
+        image = straight(np.array(mi.render(scene, sensor=sensor, spp=1)))
+        shown = image[..., :3] * image[..., 3:] + 1 - image[..., 3:]
+        written_by_run = np.asarray(Image.open(run / "test" / f"{sensor.id()}.png"), float)[..., :3] / 255
+        assert np.abs(shown - written_by_run).mean() < 4e-3
 
 
 def test_bad_settings():
