@@ -128,7 +128,7 @@ def background_stands_still(views: Sequence[View], table: Turntable) -> bool | N
 
 def _movement(views):
     """By how much the background varies from picture to picture, over how much it does within one; None where it is empty."""
-    small = lambda image: resize(np.float32(image), (_SMALL, _SMALL), anti_aliasing=True)
+    small = lambda image: np.asarray(resize(np.float32(image), (_SMALL, _SMALL), anti_aliasing=True))
     pictures = np.stack([small(view.pixels[..., :3]) for view in views])
     if views[0].pixels.dtype != np.uint8:
         pictures = 255 * np.clip(pictures, 0, 1)
