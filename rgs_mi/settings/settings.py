@@ -266,7 +266,7 @@ class Settings:
         description="Whether the light stands still to the object, or to a camera that goes round it, as on a turntable, where "
         "it is the object that turns. Unless told, poses, backgrounds and, where these leave it open, two short fits decide.",
     )
-    turns: tuple[float, ...] | None = Field(
+    turns: tuple[Annotated[float, Field(ge=-360, le=360)], ...] | None = Field(
         default=None,
         description="Degrees by which the lamps of each ring of cameras around a turntable, lowest first, are turned, because "
         "someone has moved the camera among them. Unless given, a short fit to the largest ring tells; then they are learned.",

@@ -86,7 +86,7 @@ def test_jobs_know_their_fits(dataset):
 def test_what_is_decided_is_told(dataset):
     line = told(planned(Settings(), dataset), dataset)
     assert "6 images of known cameras of 83 x 75 pixels, with masks, and 0 held out" in line
-    assert "cameras=fixed, exposure=fixed, density.max_surfels=50000" in line
+    assert "cameras=fixed, exposure=fixed, light=auto, density.max_surfels=50000" in line
     some = [replace(dataset.train[0], masked=False), *dataset.train[1:]]
     assert "6 photographs" in told(planned(Settings(), dataset), replace(dataset, train=some, photographed=True))
     assert "5 of them with masks" in told(planned(Settings(), dataset), replace(dataset, train=some))

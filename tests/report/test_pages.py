@@ -67,7 +67,17 @@ def test_settings_are_yaml_and_marked(run):
     assert yaml.safe_load(shown) == figures["settings"]
     assert command == figures["command"]
     marked = [unescape(line).split(":")[0].strip(" -{") for line in re.findall("<mark>(.*?)</mark>", text)]
-    assert marked == ["minutes", "iterations", "checkpoint_seconds", "stages", "until", "until", "surfels", "max_surfels"]
+    assert marked == [
+        "minutes",
+        "iterations",
+        "light",
+        "checkpoint_seconds",
+        "stages",
+        "until",
+        "until",
+        "surfels",
+        "max_surfels",
+    ]
 
 
 def test_names_are_escaped(run):
