@@ -95,8 +95,9 @@ class Indirect:
         normal, point = at(normal), at(self.surfels.column(mi.Vector3f, "centers"))
         local = mi.warp.square_to_cosine_hemisphere(points(n, seed, surfel, sample)[0])
         direction = mi.Frame3f(normal).to_world(local)
-        lighting = lighting.turned(dr.two_pi * (mi.Float(sample) + 0.5) / _RAYS)
-        radiance = lighting.estimator.environment.eval(direction, mi.Float(_BLUR))
+        # What rays meet is lit as azimuth 0 sees it: they are fewer there than turns.
+        turned = lighting.turned(dr.two_pi * (mi.Float(sample) + 0.5) / _RAYS)
+        radiance = turned.estimator.environment.eval(direction, mi.Float(_BLUR))
         coming = self.incident_radiance(radiance, point, normal, direction, lighting)
         total = lambda color: mi.Color3f(*(dr.block_sum(c, _RAYS) for c in color))
         return total(coming) / dr.maximum(total(radiance), 1e-6)
