@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Literal
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..core.bounding_box import BoundingBox
 from ..surfels.proxies import Proxies
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from .lighting import Lighting
 
 KINDS = ("none", "visibility", "one_bounce")
-_RAYS = 32  # from each surfel, of (9)
+_RAYS, _TURNS = 32, 8  # from each surfel, of (9); places about a turntable in which these see the light
 _BLUR = 0.5  # the roughness as whose lobe sees it the environment is taken there: few rays then see small lights, too
 
 
@@ -88,19 +89,24 @@ class Indirect:
         return replace(self, irradiance_visibility=visibility)
 
     def _irradiance_visibility(self, normal, lighting, seed):
-        n = len(self.surfels)
-        index = dr.arange(mi.UInt32, n * _RAYS)
-        surfel, sample = index // _RAYS, index % _RAYS
+        n, coming, radiance = len(self.surfels), mi.Color3f(0), mi.Color3f(0)
+        turns = 1 if lighting.turntable is None else _TURNS
+        each = _RAYS // turns  # rays that see the light in one place
+        index = dr.arange(mi.UInt32, n * each)
+        surfel = index // each
         at = lambda v: dr.gather(type(v), v, surfel)
+        total = lambda color: mi.Color3f(*(dr.block_sum(c, each) for c in color))
         normal, point = at(normal), at(self.surfels.column(mi.Vector3f, "centers"))
-        local = mi.warp.square_to_cosine_hemisphere(points(n, seed, surfel, sample)[0])
-        direction = mi.Frame3f(normal).to_world(local)
-        # What rays meet is lit as azimuth 0 sees it: they are fewer there than turns.
-        turned = lighting.turned(dr.two_pi * (mi.Float(sample) + 0.5) / _RAYS)
-        radiance = turned.estimator.environment.eval(direction, mi.Float(_BLUR))
-        coming = self.incident_radiance(radiance, point, normal, direction, lighting)
-        total = lambda color: mi.Color3f(*(dr.block_sum(c, _RAYS) for c in color))
-        return total(coming) / dr.maximum(total(radiance), 1e-6)
+        for k in range(turns):
+            light = lighting.turned(dr.opaque(mi.Float, 2 * np.pi * k / turns))
+            sample = index % each + dr.opaque(mi.UInt32, k * each)
+            local = mi.warp.square_to_cosine_hemisphere(points(n, seed, surfel, sample)[0])
+            direction = mi.Frame3f(normal).to_world(local)
+            incoming = light.estimator.environment.eval(direction, mi.Float(_BLUR))
+            coming += total(self.incident_radiance(incoming, point, normal, direction, light))
+            radiance += total(incoming)
+            dr.eval(coming, radiance)
+        return coming / dr.maximum(radiance, 1e-6)
 
     def with_visibility_as_radiance(self, surfels: Surfels, box: BoundingBox | None) -> Surfels:
         """Return ``surfels`` whose radiance is their `irradiance_visibility`, in the ``box`` (None: everywhere), to be

@@ -68,7 +68,7 @@ class Lighting:
         return self._turned(self.turntable.to_lamps(camera, width, self.turn))
 
     def _turned(self, turn):
-        return replace(self, estimator=self.estimator.turned(turn))
+        return replace(self, estimator=replace(self.estimator, environment=self.estimator.environment.turned(turn)))
 
     def turned(self, angle: "mi.Float") -> "Lighting":
         """Return the lighting as it stands to the surfels for cameras at azimuths ``angle``, radians; see `Turntable.turned`."""

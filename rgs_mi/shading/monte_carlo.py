@@ -71,10 +71,6 @@ class MonteCarlo:
         """Return the same estimator with other ``texels`` of its `FilteredEnvironment`."""
         return replace(self, environment=replace(self.environment, texels=texels))
 
-    def turned(self, turn: "mi.Matrix3f") -> "MonteCarlo":
-        """Return the same estimator under a light that is turned (`Environment.turn`)."""
-        return replace(self, environment=self.environment.turned(turn))
-
     def _integral(self, lobe, surface, incident_radiance):
         if self.paired:
             derivatives = replace(self, paired=False)._integral(lobe, surface, incident_radiance)

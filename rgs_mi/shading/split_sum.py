@@ -65,10 +65,6 @@ class SplitSum:
         """Return the same estimator with other ``texels`` of its `FilteredEnvironment`."""
         return replace(self, environment=replace(self.environment, texels=texels))
 
-    def turned(self, turn: "mi.Matrix3f") -> "SplitSum":
-        """Return the same estimator under a light that is turned (`Environment.turn`)."""
-        return replace(self, environment=self.environment.turned(turn))
-
 
 def albedo(
     cosine: "mi.Float", roughness: "mi.Float", metallic: "mi.Float", base_color: "mi.Color3f", eta: float

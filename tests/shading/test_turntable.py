@@ -54,11 +54,20 @@ def test_rotation_is_that_of_a_slow_twin():
             )
 
 
-@pytest.mark.parametrize("specular", ["split_sum", "monte_carlo"])
-@pytest.mark.parametrize("indirect", ["none", "one_bounce"])
-def test_light_goes_round_with_the_camera(specular, indirect):
+@pytest.mark.parametrize(
+    "specular, indirect, diffuse",
+    [
+        ("split_sum", "none", "radiance"),
+        ("split_sum", "one_bounce", "radiance"),
+        ("split_sum", "none", "lit"),
+        ("monte_carlo", "none", "radiance"),
+        ("monte_carlo", "one_bounce", "radiance"),
+        ("monte_carlo", "one_bounce", "lit"),
+    ],
+)
+def test_light_goes_round_with_the_camera(specular, indirect, diffuse):
     surfels, light = sphere_surfels(200, scale=0.9, opacity_shift=3), environment()
-    shading = Shading(specular=specular, indirect=indirect, samples=4)
+    shading = Shading(specular=specular, diffuse=diffuse, indirect=indirect, samples=4)
     for angle in (0.3, 3.0):
         camera = orbit_camera(angle)
         turned = replace(light, rotation=Rotation.from_rotvec(AXIS * azimuth(camera)).as_matrix() @ light.rotation)
@@ -68,6 +77,30 @@ def test_light_goes_round_with_the_camera(specular, indirect):
         # single numbers jump where a sample falls to the other side of something
         assert np.mean(np.abs(found - expected) > 1e-3) < 2e-3
         assert np.abs(found - still).mean() > 20 * np.abs(found - expected).mean() > 0
+
+
+def test_what_surfels_hide_of_a_light_is_a_mean_over_its_turns():
+    """Of a light that is the same all around the axis it is what they hide of one that stands still; of a lamp on one side it
+    is as if the lamp stood on all sides at once."""
+    axis = Turntable((0, 0, 1), (0, 0, 0))
+    upright = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+    round_, lamp = np.zeros((2, 16, 32, 3), np.float32)
+    round_[:] = np.linspace(3, 0.2, 16)[:, None, None]
+    lamp[:, 6:10] = 5.0
+    around = np.mean([np.roll(lamp, 4 * k, 1) for k in range(8)], 0)
+    surfels = sphere_surfels(150, scale=0.9, opacity_shift=3)
+
+    def hidden(texels, turntable):
+        shading = Shading(diffuse="lit", indirect="one_bounce", turntable=turntable)
+        light = Environment(mi.TensorXf(np.ascontiguousarray(texels)), upright).filtered()
+        found = [lighting_of(shading, surfels, light, seed=k).indirect.irradiance_visibility.numpy() for k in range(30)]
+        return np.mean(found, 0), np.std(found, 0) / np.sqrt(len(found))
+
+    still, turned = hidden(round_, None)[0], hidden(round_, axis)[0]
+    assert still.min() < 0.8 and np.abs(still - turned).max() < 1e-3
+    (expected, a), (found, b) = hidden(around, None), hidden(lamp, axis)
+    assert np.mean(np.abs(found - expected) < 4 * np.hypot(a, b) + 0.02) > 0.98
+    assert np.abs(hidden(lamp, None)[0] - expected).mean() > 3 * np.abs(found - expected).mean()
 
 
 def test_what_is_learned_of_a_pose_and_a_turn_has_derivatives():
