@@ -169,20 +169,21 @@ def _concatenate(clouds):
 
 def box_of(props: "mi.Properties") -> BoundingBox | None:
     """Return the property ``box`` of an integrator, None where it has none. Raises: UserError for a bad one."""
-    text = props.get("box", "")
-    try:
-        return BoundingBox.of(text.replace(",", " ").split()) if text else None
-    except ValueError as error:
-        raise UserError(f"box '{text}': {error}") from error
+    return _of_numbers(props, "box", BoundingBox.of)
 
 
 def turntable_of(props: "mi.Properties") -> Turntable | None:
     """Return the property ``turntable`` of an integrator, None where it has none. Raises: UserError for a bad one."""
-    text = props.get("turntable", "")
+    return _of_numbers(props, "turntable", Turntable.of)
+
+
+def _of_numbers(props, name, make):
+    """What ``make`` makes of the numbers of the property ``name``; None where there is none."""
+    text = props.get(name, "")
     try:
-        return Turntable.of(text.replace(",", " ").split()) if text else None
+        return make(text.replace(",", " ").split()) if text else None
     except ValueError as error:
-        raise UserError(f"turntable '{text}': {error}") from error
+        raise UserError(f"{name} '{text}': {error}") from error
 
 
 def resolve(path: str) -> str:

@@ -184,12 +184,9 @@ def _resume(saved, scene, dataset, settings) -> Fit:
     """The fit of a checkpoint, under ``settings``; tells which differ from those that it was saved with."""
     arrays, meta = saved
     settings = planned(settings, dataset)
-    if settings.box is None and (box := meta["settings"].get("box")):
-        settings = replace(settings, box=tuple(box))
-    if settings.light == "auto":
-        settings = replace(settings, light=meta["settings"].get("light", "world"))
-    if settings.turns is None and (turns := meta["settings"].get("turns")):
-        settings = replace(settings, turns=tuple(turns))
+    for name in ("box", "light", "turns"):  # what was decided at the start
+        if getattr(settings, name) in (None, "auto") and (value := meta["settings"].get(name)):
+            settings = replace(settings, **{name: tuple(value) if isinstance(value, list) else value})
     if meta["photographs"] != _photographs(dataset):
         raise UserError(f"{dataset.root}: not the photographs of the checkpoint: give its --data, or another --out")
     old, new = _flat(meta["settings"]), _flat(to_dict(settings))

@@ -1,7 +1,7 @@
 """Where the light stands: still to the object, or to a camera that goes round it, since it is the object that turns."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import drjit as dr
@@ -79,7 +79,7 @@ def tried(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, settings
             while fit.progress < 1:
                 fit.step()
                 progress.update((k + fit.progress) / 2)
-            scores[light] = _score(fit, held_out)
+            (scores[light],) = _scores(fit, held_out)
             release_memory()
     better = max(scores, key=lambda light: scores[light])
     difference = scores["turntable"] - scores["world"]
@@ -95,7 +95,7 @@ def ring_turns(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, set
     photographs sees some of each other ring under lamps that are turned all around; where no turn makes those clearly better,
     there is none."""
     table = turntable_of(settings, dataset)
-    if settings.turns is not None or table is None or len(table.rings) < 2:
+    if settings.turns is not None or table is None or len(table.rings) < 2 or settings.specular_start >= 1:
         return settings
     ring = [table.ring(view.camera) for view in dataset.train]
     count = len(table.rings)
@@ -110,10 +110,10 @@ def ring_turns(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, set
         others = [k for k in range(count) if k != first]
         for done, k in enumerate(others):
             few = members[k][:: max(1, len(members[k]) // _SHOWN)]
-            score = lambda turn: _score(fit, few, np.radians(turn))
-            best = max(np.arange(-180, 180, _COARSE), key=score)
-            best = max(best + np.arange(-_COARSE, _COARSE + 1, _FINE), key=score)
-            turns[k] = float(best) if score(best) > score(0) + _CLEAR else 0.0
+            around = np.arange(-180, 180, _COARSE)
+            near = around[np.argmax(_scores(fit, few, around))] + np.arange(-_COARSE, _COARSE + 1, _FINE)
+            still, *scores = _scores(fit, few, [0, *near])
+            turns[k] = float(near[np.argmax(scores)]) if max(scores) > still + _CLEAR else 0.0
             progress.update(0.8 + 0.2 * (done + 1) / len(others))
     release_memory()
     if any(turns) and not quiet:
@@ -137,19 +137,21 @@ def _short(settings, light):
     )
 
 
-def _score(fit: Fit, views: list[View], turn: float | None = None) -> float:
-    """The mean PSNR of ``views`` at the resolution of the fit; ``turn`` is that of their lamps, radians (None: as it is)."""
+def _scores(fit: Fit, views: list[View], turns: Sequence[float | None] = (None,)) -> list[float]:
+    """The mean PSNR of ``views`` at the resolution of the fit, for each of ``turns`` of their lamps, degrees (None: its own)."""
     photographs = Photographs(views, fit.stage.downscale, fit.settings.background)
-    errors = []
+    shown = [photographs.tile(k) for k in range(len(views))]
+    scores = []
     with dr.suspend_grad():
         surfels = fit.model.surfels(fit.sh_order)
         lighting = fit.lighting(surfels)
         assert lighting is not None, "something is specular"
-        if turn is not None:
-            lighting = replace(lighting, turn=dr.opaque(mi.Float, float(turn)))
-        for k in range(len(views)):
-            photograph = photographs.tile(k)
-            image = deferred.render(surfels, photograph.camera, lighting)
-            shown = losses.display(image.color, image.gbuffer.all.alpha, photograph.behind)
-            errors.append(float(dr.mean(dr.mean(dr.square(shown - photograph.color)))[0]))
-    return float(np.mean(-10 * np.log10(np.maximum(errors, 1e-10))))
+        for turn in turns:
+            turned = replace(lighting, turn=None if turn is None else dr.opaque(mi.Float, float(np.radians(turn))))
+            errors = []
+            for photograph in shown:
+                image = deferred.render(surfels, photograph.camera, turned)
+                color = losses.display(image.color, image.gbuffer.all.alpha, photograph.behind)
+                errors.append(float(dr.mean(dr.mean(dr.square(color - photograph.color)))[0]))
+            scores.append(float(np.mean(-10 * np.log10(np.maximum(errors, 1e-10)))))
+    return scores

@@ -16,6 +16,14 @@ _FIRST = 25_000  # surfels to start with, at least
 _COARSEST, _FINEST_FROM = 220, 0.2  # side of a square of as many pixels, about; the part of the fit before full resolution
 STEPS = 500, 1000  # of a level before the next: of one below half resolution, and of that
 LAST = 0.25  # of the fit: there half as fine is not fine enough, if every view can be seen once more
+_OPEN = (
+    "max_surfels",
+    "surfels",
+    "stages",
+    "box",
+    "light",
+    "turns",
+)  # settings that a fit decides on where they are not given
 LEAST_STEPS = 250, 1000  # that there must be time for at the next: at half resolution and below, and at full resolution
 
 
@@ -66,27 +74,15 @@ def told(settings: Settings, dataset: Dataset) -> str:
 
 def agree(asked: Mapping, saved: Mapping) -> bool:
     """Return whether the settings ``saved`` with a fit, nested dicts, are those ``asked`` for, but for what they leave open."""
-    open_ = lambda tree: (
-        tree["density"]["max_surfels"],
-        tree["initialization"]["surfels"],
-        tree["stages"],
-        tree["box"],
-        tree["light"],
-        tree["turns"],
-    )
-    try:
-        chosen = [there if own in (None, "auto") else own for own, there in zip(open_(asked), open_(saved))]
-    except (KeyError, TypeError):
-        return False
-    return saved == {
-        **asked,
-        "density": {**asked["density"], "max_surfels": chosen[0]},
-        "initialization": {**asked["initialization"], "surfels": chosen[1]},
-        "stages": chosen[2],
-        "box": chosen[3],
-        "light": chosen[4],
-        "turns": chosen[5],
-    }
+
+    def same(own, there):
+        if isinstance(own, Mapping) and isinstance(there, Mapping):
+            return own.keys() == there.keys() and all(
+                same(own[name], there[name]) or (name in _OPEN and own[name] in (None, "auto")) for name in own
+            )
+        return own == there
+
+    return same(asked, saved)
 
 
 def _foreground(view: View) -> float:
