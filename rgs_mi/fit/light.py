@@ -110,7 +110,7 @@ def ring_turns(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, set
         others = [k for k in range(count) if k != first]
         for done, k in enumerate(others):
             few = members[k][:: max(1, len(members[k]) // _SHOWN)]
-            around = np.arange(-180, 180, _COARSE)
+            around = list(range(-180, 180, _COARSE))
             near = around[np.argmax(_scores(fit, few, around))] + np.arange(-_COARSE, _COARSE + 1, _FINE)
             still, *scores = _scores(fit, few, [0, *near])
             turns[k] = float(near[np.argmax(scores)]) if max(scores) > still + _CLEAR else 0.0
