@@ -1,13 +1,15 @@
 """A shiny object in a room that photographs show, without masks and points: what phones make of it.
 
 ``python tests/room.py DATA`` path-traces the helmet in a closed room, with textures on its walls, into a capture in
-nerfstudio's layout, which fits take for photographs, without masks; silhouettes in the held-out ones lie beside them.
+nerfstudio's layout, which fits take for photographs, without masks; silhouettes in them lie beside them. ``--masked FROM`` takes
+the photographs that lie in FROM, with their silhouettes as masks.
 ``rgs-mi optimize object --data DATA --out RUN --minutes 10`` fits it, and ``python tests/room.py DATA --score RUN`` prints
 how good RUN is within the object's silhouette.
 """
 
 import argparse
 import math
+import shutil
 from pathlib import Path
 
 import rgs_mi  # before mitsuba, so that it can choose a working LLVM
@@ -117,13 +119,25 @@ def render(out):
             if not path.is_file():
                 test = split == "test"
                 linear = renderer.radiance(camera, SPP * (2 if test else 1), 1000 * test + i)[..., :3]
-                if test:
-                    Image.fromarray(to_8bit(silhouettes.aov(camera)[..., -1])).save(out / "silhouettes" / path.name)
+                Image.fromarray(to_8bit(silhouettes.aov(camera)[..., -1])).save(out / "silhouettes" / path.name)
                 Image.fromarray(to_8bit(srgb_encode(np.clip(EXPOSURE * linear, 0, 1)))).save(path)
             progress.update(len(frames) / len(views), views=len(frames))
     names = {f"{split}_filenames": [f["file_path"] for f in frames if f"/{split}_" in f["file_path"]] for split in COUNTS}
     lens = {"fl_x": focal, "fl_y": focal, "cx": SIZE / 2, "cy": SIZE / 2, "w": SIZE, "h": SIZE}
     write_json(out / "transforms.json", {"camera_model": "PINHOLE", **lens, "frames": frames, **names})
+
+
+def mask(source, out):
+    """Write the data set of ``source`` with its silhouettes as masks."""
+    for folder in ("images", "silhouettes"):
+        (out / folder).mkdir(parents=True, exist_ok=True)
+    shutil.copy(source / "transforms.json", out)
+    for path in sorted((source / "images").glob("*.png")):
+        silhouette = Image.open(source / "silhouettes" / path.name)
+        photograph = Image.open(path).convert("RGB")
+        photograph.putalpha(silhouette)
+        photograph.save(out / "images" / path.name)
+        silhouette.save(out / "silhouettes" / path.name)
 
 
 def score(data, run):
@@ -143,10 +157,16 @@ def score(data, run):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
+    parser.add_argument("--masked", type=Path, metavar="FROM")
     parser.add_argument("--score", type=Path, metavar="RUN")
     args = parser.parse_args()
     rgs_mi.set_variant()
-    score(args.data, args.score) if args.score else render(args.data)
+    if args.score:
+        score(args.data, args.score)
+    elif args.masked:
+        mask(args.masked, args.data)
+    else:
+        render(args.data)
 
 
 if __name__ == "__main__":

@@ -111,7 +111,8 @@ def ring_turns(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, set
         for done, k in enumerate(others):
             few = members[k][:: max(1, len(members[k]) // _SHOWN)]
             around = list(range(-180, 180, _COARSE))
-            near = around[np.argmax(_scores(fit, few, around))] + np.arange(-_COARSE, _COARSE + 1, _FINE)
+            best = around[int(np.argmax(_scores(fit, few, around)))]
+            near = list(range(best - _COARSE, best + _COARSE + 1, _FINE))
             still, *scores = _scores(fit, few, [0, *near])
             turns[k] = float(near[np.argmax(scores)]) if max(scores) > still + _CLEAR else 0.0
             progress.update(0.8 + 0.2 * (done + 1) / len(others))
