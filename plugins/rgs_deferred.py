@@ -24,12 +24,13 @@ what a principled BSDF with the G-buffer's material reflects of the environment 
  * - indirect
    - |string|
    - What a reflected ray that meets a surfel brings: ``none``, the environment behind it; ``visibility``, nothing;
-     ``one_bounce``, the surfel's own radiance, which in turn reflects the environment alone. Where the diffuse radiance is
+     ``one_bounce``, the surfel's own radiance, which in turn reflects the environment alone, or with ``two_bounces`` other
+     surfels. Where the diffuse radiance is
      ``lit``, the same holds for its light (Default: ``none``)
 
  * - box
    - |string|
-   - Six numbers, lower and upper corner: only what lies in this box reflects light, and is met by reflected rays. What lies
+   - Six numbers, lower and upper corner: only what lies in this box reflects light. What lies
      beyond, the surroundings in a capture without masks, has its diffuse radiance alone (Default: none, everything)
 
  * - turntable
@@ -38,6 +39,12 @@ what a principled BSDF with the G-buffer's material reflects of the environment 
      of a point on it. The environment is as a sensor at azimuth 0 sees it, and goes about the axis with the sensor; two more
      numbers for each ring of sensors, its elevation and how much farther its lamps are turned, in degrees, say where it was not
      the object alone that turned (Default: none, the light stands still)
+
+ * - room
+   - |string|
+   - A room on whose walls the environment is painted: nine numbers, x, y, z of its center in world space, from which the map is
+     seen, and the distances to the walls -x, +x, -y, +y, -z, +z of the environment's frame, ``inf`` where there is none
+     (Default: none, the environment is at infinity)
 
  * - shader
    - |string|
@@ -76,7 +83,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from rgs_mi.core.camera import Camera, pixel_directions
+from rgs_mi.core.camera import Camera, opaque, pixel_directions
 from rgs_mi.core.errors import UserError
 from rgs_mi.shading import deferred, indirect
 from rgs_mi.shading.environment import Environment, FilteredEnvironment
@@ -85,7 +92,7 @@ from rgs_mi.shading.monte_carlo import SAMPLES
 from rgs_mi.shading.shader import Shader
 from rgs_mi.surfels.surfels import Surfels
 
-from .surfels import box_of, resolve, surfels_in, turntable_of
+from .surfels import box_of, resolve, room_of, surfels_in, turntable_of
 
 AOVS = {
     "depth": "T",
@@ -116,7 +123,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         if self.samples < 1:
             raise UserError(f"rgs_deferred: samples is {self.samples}: needs at least 1")
         self.indirect = _choice(props, "indirect", "none", indirect.KINDS)
-        self.box, self.turntable = box_of(props), turntable_of(props)
+        self.box, self.turntable, self.room = box_of(props), turntable_of(props), room_of(props)
         self.shader_file = resolve(props.get("shader", ""))
         self.shader = Shader.load(self.shader_file) if self.shader_file else None
         self.aovs = _aovs(props.get("aovs", ""))
@@ -200,7 +207,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         if not self.hide_emitters and environment is not None:
             if self.turntable is not None:
                 environment = environment.turned(self.turntable.to_lamps(camera))
-            color, alpha = color + (1 - alpha) * environment.eval(rays), mi.Float(1)
+            color, alpha = color + (1 - alpha) * environment.eval(rays, point=opaque(camera).origin), mi.Float(1)
         values = [*color, *([alpha] if has_alpha else []), mi.Float(1)]
         for kind in self.aovs.values():
             values += _aov(kind, image, maps, camera, rays)
@@ -232,7 +239,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
             if self.specular == "none":
                 return None
             raise UserError("rgs_deferred: the scene has no environment: add an 'envmap' or 'constant' emitter")
-        environment = Environment.from_emitter(emitter)
+        environment = replace(Environment.from_emitter(emitter), room=self.room)
         if self.specular != "split_sum":
             return environment.unfiltered()
         if dr.grad_enabled(environment.texels):

@@ -49,6 +49,7 @@ import mitsuba as mi
 from rgs_mi.core.bounding_box import BoundingBox
 from rgs_mi.core.errors import UserError
 from rgs_mi.core.turntable import Turntable
+from rgs_mi.shading.room import Room
 from rgs_mi.shading.split_sum import DEFAULT_ETA
 from rgs_mi.surfels.ply import read_ply
 from rgs_mi.surfels.proxies import corners, quads
@@ -175,6 +176,11 @@ def box_of(props: "mi.Properties") -> BoundingBox | None:
 def turntable_of(props: "mi.Properties") -> Turntable | None:
     """Return the property ``turntable`` of an integrator, None where it has none. Raises: UserError for a bad one."""
     return _of_numbers(props, "turntable", Turntable.of)
+
+
+def room_of(props: "mi.Properties") -> Room | None:
+    """Return the property ``room`` of an integrator, None where it has none. Raises: UserError for a bad one."""
+    return _of_numbers(props, "room", Room.of)
 
 
 def _of_numbers(props, name, make):

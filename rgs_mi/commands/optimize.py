@@ -122,6 +122,8 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
         extent = box.radius
         points = _with_surroundings(points, dataset, settings)
 
+    middle = points[0].mean(0) if box is None else 0.5 * (np.array(box.min) + box.max)
+
     def fit_of(shown, settings):
         positions, normals, colors, spacing = points
         model = Model.start(
@@ -138,6 +140,7 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
             begin.roughness,
             settings.shader,
             two_sided=None if box is None else True,
+            room=settings.room and (middle, settings.room * extent),
         )
         return Fit(shown, model, settings, extent, _shading(scene, settings, dataset), _priors(shown, settings))
 

@@ -58,6 +58,7 @@ def export(
             "shader": SHADER if shader else None,
             "box": shading.box,
             "turntable": shading.turntable,
+            "room": environment.room,
         },
     )
     if any(abs(v.camera.focal[0] / v.camera.focal[1] - 1) > _SQUARE for v in views):

@@ -19,7 +19,7 @@ MATERIAL = {"roughness": 1, "metallic": 1, "base_color": 3}
 def relight(scene: "mi.Scene", path: str | Path, envmap: str | Path | None = None, rotate: float = 0.0) -> None:
     """Put another ``envmap`` (an image, latitude-longitude, or the name of an environment of the suite; None: as it is) into
     the ``scene`` that was loaded from ``path``, in the place and orientation of its own, turned by ``rotate`` degrees about
-    its up axis. Another map stands still, where its own goes round with the camera, as on a turntable.
+    its up axis. Another map stands still, where its own goes round with the camera, as on a turntable, and is at infinity.
 
     Raises: UserError for a scene without an environment map, and an image that can't be read.
     """
@@ -31,7 +31,7 @@ def relight(scene: "mi.Scene", path: str | Path, envmap: str | Path | None = Non
         params["data"] = mi.traverse(_load(envmap))["data"]
         params["scale"] = 1.0
         if is_deferred(integrator := scene.integrator()):
-            integrator.turntable = None
+            integrator.turntable = integrator.room = None
     turned = mi.ScalarTransform4f().rotate([0, 1, 0], rotate)  # an envmap's up axis is y
     params["to_world"] = mi.Transform4f(mi.ScalarTransform4f(np.array(params["to_world"].matrix).reshape(4, 4)) @ turned)
     params.update()

@@ -191,7 +191,7 @@ def with_aovs(scene: "mi.Scene", path: str | Path) -> "mi.Integrator":
     own = scene.integrator()
     if not is_deferred(own):
         raise UserError(f"{path}: maps come from the integrator 'rgs_deferred' only: leave out --aovs")
-    given = {name: str(value) for name in ("box", "turntable") if (value := getattr(own, name))}
+    given = {name: str(value) for name in ("box", "turntable", "room") if (value := getattr(own, name))}
     kept = ("specular", "diffuse", "samples", "indirect", "hide_emitters")
     return mi.load_dict(
         {"type": "rgs_deferred", "shader": own.shader_file, "aovs": ",".join(AOVS)}

@@ -1,11 +1,14 @@
 """What a fit learns: surfels, environment and shader in unconstrained form, and the optimizer that moves them."""
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import as_float, as_tensor
 from ..shading.environment import Environment
+from ..shading.room import SIDES, Room
 from ..shading.shader import Shader, initial_weights
 from ..surfels.surfels import SH_0, Surfels
 
@@ -23,7 +26,7 @@ SURFEL_PARAMETERS = (
     "delta_normal",
     "curvature",
 )
-ENVIRONMENT, SHADER = "log_environment", "shader"
+ENVIRONMENT, SHADER, ROOM = "log_environment", "shader", "log_nearness"
 #: The step of 3DGS's optimizers is relative to the gradient's own size, however small.
 _EPSILON = 1e-15
 _LOG_RADIANCE = (-9.0, 8.0)  # texels that no ray tells apart would else drift to overflow
@@ -44,12 +47,20 @@ class Model:
     """Surfels, environment and shader as Adam sees them.
 
     ``parameters`` are NumPy arrays [N, channels] named as `SURFEL_PARAMETERS`, `ENVIRONMENT` [rows, columns, 3], the
-    logarithm of radiance, and `SHADER` [weights], unless f_φ is the identity. ``rotation`` [3, 3] takes the environment's
-    frame to the world's. ``two_sided`` is that of `Surfels`.
+    logarithm of radiance, `SHADER` [weights], unless f_φ is the identity, and `ROOM` [6], the logarithm of how near the walls
+    of a `Room` around ``center`` ([3], world space) are, unless the light is at infinity. ``rotation`` [3, 3] takes the
+    environment's frame to the world's. ``two_sided`` is that of `Surfels`.
     """
 
-    def __init__(self, parameters: dict[str, np.ndarray], rotation: np.ndarray, two_sided: bool = True) -> None:
+    def __init__(
+        self,
+        parameters: dict[str, np.ndarray],
+        rotation: np.ndarray,
+        two_sided: bool = True,
+        center: np.ndarray | Sequence[float] = (0, 0, 0),
+    ) -> None:
         self.rotation, self.two_sided = np.asarray(rotation, np.float64), bool(two_sided)
+        self.center = np.asarray(center, np.float64)
         self.optimizer = mi.ad.Adam(lr=1e-3, epsilon=_EPSILON)
         for name, value in parameters.items():
             self.optimizer[name] = as_tensor(value)
@@ -70,6 +81,7 @@ class Model:
         roughness: float = 0.3,
         shader: str = "identity",
         two_sided: bool | None = None,
+        room: tuple[Sequence[float], float] | None = None,
     ) -> "Model":
         """Make the model that a fit starts with.
 
@@ -83,6 +95,7 @@ class Model:
           opacity, roughness: of all surfels
           shader:      'identity' or 'mlp', as in `Settings`
           two_sided:   see `Surfels` (None: where normals are random; others point outwards)
+          room:        center and distance of the walls on which the environment is painted (None: it is at infinity)
         """
         from ..surfels.surfels import rotation_from_normal
 
@@ -108,9 +121,11 @@ class Model:
                 "curvature": np.zeros((n, 3)),
                 ENVIRONMENT: np.log(np.maximum(environment, 1e-3)),
                 **({SHADER: initial_weights(seed)} if shader == "mlp" else {}),
+                **({ROOM: np.full(len(SIDES), -np.log(room[1]))} if room else {}),
             },
             rotation,
             two_sided,
+            room[0] if room else (0, 0, 0),
         )
 
     def __len__(self) -> int:
@@ -142,7 +157,9 @@ class Model:
 
     def environment(self) -> Environment:
         """Return the environment, non-negative by construction; differentiable."""
-        return Environment(dr.exp(dr.clip(self.optimizer[ENVIRONMENT], *_LOG_RADIANCE)), self.rotation)
+        x, y, z = map(float, self.center)
+        room = Room((x, y, z), dr.exp(self.optimizer[ROOM]).array) if ROOM in self.optimizer else None
+        return Environment(dr.exp(dr.clip(self.optimizer[ENVIRONMENT], *_LOG_RADIANCE)), self.rotation, room=room)
 
     def shader(self) -> Shader | None:
         """Return f_φ; None: the identity."""
@@ -191,7 +208,7 @@ class Model:
 
     def state(self) -> dict[str, np.ndarray]:
         """Return everything that a checkpoint needs, as NumPy arrays."""
-        arrays = {"rotation": self.rotation, "two_sided": np.array(self.two_sided)}
+        arrays = {"rotation": self.rotation, "two_sided": np.array(self.two_sided), "center": self.center}
         for name in self.optimizer.keys():
             t, m, v, _ = self.optimizer.state[name][3]
             arrays |= {
@@ -205,8 +222,9 @@ class Model:
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray]) -> "Model":
         """Make the model whose `state` these ``arrays`` are."""
-        names = [name for name in (*SURFEL_PARAMETERS, ENVIRONMENT, SHADER) if name in arrays]
-        model = cls({name: arrays[name] for name in names}, arrays["rotation"], bool(arrays["two_sided"]))
+        names = [name for name in (*SURFEL_PARAMETERS, ENVIRONMENT, SHADER, ROOM) if name in arrays]
+        parameters = {name: arrays[name] for name in names}
+        model = cls(parameters, arrays["rotation"], bool(arrays["two_sided"]), arrays.get("center", (0, 0, 0)))
         for name in names:
             model._set_moments(name, mi.UInt32(int(arrays[f"{name}.t"])), *(as_float(arrays[f"{name}.{k}"]) for k in "mv"))
         return model

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..settings.settings import Settings, Stage
 from ..shading.lighting import Shading
-from .model import ENVIRONMENT, SHADER
+from .model import ENVIRONMENT, ROOM, SHADER
 
 #: The field of `LearningRates` that each parameter of a `Model` obeys.
 _RATES = {
@@ -24,6 +24,7 @@ _RATES = {
     "curvature": "curvature",
     ENVIRONMENT: "environment",
     SHADER: "shader",
+    ROOM: "room",
 }
 _NORMALS, _HELD = ("rotations", "delta_normal", "curvature"), 0.1  # the part of their rates that they have at first
 # A mirror ball, its radius r 3/8 of the picture, turns what its middle reflects by 2/r a pixel: π r/2 rows are told apart

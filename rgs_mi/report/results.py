@@ -25,6 +25,7 @@ from ..fit.curves import Curves
 from ..settings.config import to_dict
 from ..shading.environment import Environment
 from ..shading.lighting import Lighting
+from ..shading.room import SIDES
 from ..surfels.surfels import Surfels
 from . import cameras
 from .figures import label, text
@@ -171,7 +172,7 @@ def finished(folder: Path) -> bool:
 
 def _facts(fit) -> dict:
     """What metrics.json says of the run as a whole, beside `measure`."""
-    table = fit.shading.turntable
+    table, room = fit.shading.turntable, fit.model.environment().room
     return {
         "finished": fit.progress >= 1,
         "train_seconds": fit.elapsed,
@@ -182,6 +183,7 @@ def _facts(fit) -> dict:
         "train_views": len(fit.dataset.train),
         "test_views": len(fit.dataset.test),
         "turntable": table and asdict(table),
+        "room": room and {"center": room.center, "distances": dict(zip(SIDES, room.distances))},
         "photographs": str(fit.dataset.root.resolve()),
         "settings": to_dict(fit.settings),
         **circumstances(),

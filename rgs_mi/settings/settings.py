@@ -80,6 +80,7 @@ class LearningRates:
     curvature: Rates = Field(default=(2e-3, 2e-4), description="Of the curvatures; 0 leaves every surfel one normal.")
     environment: Rates = Field(default=(6e-2, 5e-3), description="Of the environment's texels.")
     shader: Rates = Field(default=(1e-2, 1e-3), description="Of the network of `shader`.")
+    room: Rates = Field(default=(2e-2, 1e-3), description="Of the distances of the room's walls, their logarithms.")
     poses: Rates = Field(
         default=(0.2, 0.01), description="Of the cameras' poses: pixels of the images in use that what they show moves by."
     )
@@ -244,7 +245,7 @@ class Settings:
     shader: Literal["identity", "mlp"] = Field(
         default="identity", description="f_φ of C = C_d + f_φ(C_s): nothing, or a tiny network trained along."
     )
-    indirect: Literal["none", "visibility", "one_bounce"] = Field(
+    indirect: Literal["none", "visibility", "one_bounce", "two_bounces"] = Field(
         default="one_bounce", description="What reflected rays that meet surfels bring."
     )
     indirect_start: float = Field(
@@ -270,6 +271,13 @@ class Settings:
         default=None,
         description="Degrees by which the lamps of each ring of cameras around a turntable, lowest first, are turned, because "
         "someone has moved the camera among them. Unless given, a short fit to the largest ring tells; then they are learned.",
+    )
+    room: float | None = Field(
+        default=None,
+        gt=0,
+        le=1e6,
+        description="The light is painted on the walls of a room, so many radii of the object from its middle at first; then "
+        "they are learned. Unless given, it is at infinity.",
     )
     cameras: Literal["fixed", "learned"] = Field(
         default="fixed",

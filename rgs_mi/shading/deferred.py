@@ -63,11 +63,11 @@ def _reflected(gbuffer, camera, lighting):
         m, lighting = gbuffer.maps(index), lighting.seen_by(camera, dr.width(index))
         mean = dr.rcp(m.alpha)
         normal, direction = dr.normalize(m.normal), pixel_directions(camera, index)
-        point = None if lighting.indirect is None else _points(camera, direction, m.depth * mean)
-        surface = Surface(normal, -direction, m.roughness * mean, m.metallic * mean, m.base_color * mean)
-        dr.scatter(specular, lighting.specular(surface, point) * m.alpha, index)
+        point = _points(camera, direction, m.depth * mean) if lighting.near else None
+        surface = Surface(normal, -direction, m.roughness * mean, m.metallic * mean, m.base_color * mean, point)
+        dr.scatter(specular, lighting.specular(surface) * m.alpha, index)
         if lighting.lit:
-            lit = lighting.diffuse(surface, point, lighting.irradiance_visibility(m, mean))
+            lit = lighting.diffuse(surface, lighting.irradiance_visibility(m, mean))
             dr.scatter(diffuse, lit * m.alpha, index)
     return diffuse, specular
 

@@ -14,6 +14,7 @@ import numpy as np
 from ..core.errors import UserError
 from ..splat.hit import adding
 from . import prefilter as _prefilter
+from .room import Room
 
 #: Callback ``(radiance, direction, index)`` that returns incident radiance after occlusion along the world-space unit
 #: ``direction`` at the surfaces ``index`` (None: one direction for each surface), where the unoccluded environment has
@@ -29,11 +30,14 @@ class Environment:
     rotation  [3, 3] emitter frame to world frame
     turn      rotation of world-space directions that comes before, of a light that stands elsewhere than in that frame by now
               (see `Turntable.to_lamps`; None: none)
+    room      walls on which it is painted, near enough that it depends on the place what is seen of them (None: it is at
+              infinity)
     """
 
     texels: "mi.TensorXf"
     rotation: np.ndarray
     turn: "mi.Matrix3f | None" = None
+    room: Room | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -59,8 +63,31 @@ class Environment:
 
     def to_local(self, d: "mi.Vector3f") -> "mi.Vector3f":
         """Turn world-space directions into the emitter's frame."""
-        to_local = [[dr.opaque(mi.Float, float(v)) for v in row] for row in np.linalg.inv(self.rotation)]
-        return mi.Matrix3f(to_local) @ (d if self.turn is None else self.turn @ d)
+        return _matrix(np.linalg.inv(self.rotation)) @ (d if self.turn is None else self.turn @ d)
+
+    def to_world(self, d: "mi.Vector3f") -> "mi.Vector3f":
+        """Turn directions in the emitter's frame into those of world space before the `turn`."""
+        return _matrix(self.rotation) @ d
+
+    def seen(self, d: "mi.Vector3f", point: "mi.Point3f | None") -> "tuple[mi.Vector3f, mi.Float, mi.Float]":
+        """Return where in the emitter's frame the map has what comes to ``point`` along world-space ``d``, how much farther from
+        the room's center than from the point that is, and the density of those directions over these; see `Room.seen`. Without
+        a room, or a point, the point sees what the center sees."""
+        local = self.to_local(d)
+        if self.room is None or point is None:
+            return local, mi.Float(1), mi.Float(1)
+        return self.room.seen(local, self.to_local(self._from_center(point)))
+
+    def seen_from(self, d: "mi.Vector3f", point: "mi.Point3f | None") -> "mi.Vector3f":
+        """Return along which world-space directions ``point`` sees what the emitter, which knows neither turn nor room, has
+        along ``d``."""
+        if self.room is not None and point is not None:
+            local = _matrix(np.linalg.inv(self.rotation)) @ d
+            d = self.to_world(self.room.seen_from(local, self.to_local(self._from_center(point))))
+        return d if self.turn is None else self.turn.T @ d
+
+    def _from_center(self, point):
+        return mi.Vector3f(point - mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in self.room.center)))
 
     def filtered(self) -> "FilteredEnvironment":
         """Return the environment convolved with the BSDF's lobe at every level of roughness (docs/method.md §3)."""
@@ -92,6 +119,10 @@ class Environment:
         return mi.load_dict({"type": "scene", "emitter": emitter}).environment()
 
 
+def _matrix(rows):
+    return mi.Matrix3f([[dr.opaque(mi.Float, float(v)) for v in row] for row in rows])
+
+
 @dataclass
 class FilteredEnvironment:
     """An ``environment`` filtered by an ``operator``: ``texels`` are the maps of all its levels, padded to four floats a
@@ -104,6 +135,18 @@ class FilteredEnvironment:
     def turned(self, turn: "mi.Matrix3f") -> "FilteredEnvironment":
         """Return the same environment with `Environment.turn`."""
         return replace(self, environment=replace(self.environment, turn=turn))
+
+    def learned(self) -> list:
+        """Return the arrays that a fit changes: the texels of all levels, and how near walls are where there is a room."""
+        room = self.environment.room
+        return [self.texels, *([room.nearness] if room else [])]
+
+    def with_learned(self, arrays: list) -> "FilteredEnvironment":
+        """Return the same environment with other ``arrays`` in place of `learned`."""
+        environment = self.environment
+        if environment.room:
+            environment = replace(environment, room=replace(environment.room, nearness=arrays[1]))
+        return replace(self, texels=arrays[0], environment=environment)
 
     def _level(self, longitude, colatitude, level):
         """Bilinear lookup in the map ``level`` (``mi.UInt32``); longitude and colatitude in [0, 1]."""
@@ -126,9 +169,9 @@ class FilteredEnvironment:
         value = dr.lerp(top, bottom, fy)
         return mi.Color3f(value.x, value.y, value.z)
 
-    def _coordinates(self, direction):
-        """(longitude, colatitude) of world-space unit ``direction``, in [0, 1]."""
-        d = self.environment.to_local(direction)
+    @staticmethod
+    def _coordinates(d):
+        """(longitude, colatitude) of a unit vector in the emitter's frame, in [0, 1]."""
         # atan2 and acos have no derivative at the poles, where longitude does not matter: stay clear of them
         horizontal = dr.maximum(dr.square(d.x) + dr.square(d.z), 1e-10)
         longitude = dr.atan2(d.x, dr.select(dr.abs(d.z) + dr.abs(d.x) > 1e-5, -d.z, 1e-5)) / dr.two_pi
@@ -136,12 +179,21 @@ class FilteredEnvironment:
         colatitude = dr.atan2(dr.sqrt(horizontal), d.y) / dr.pi
         return longitude, colatitude
 
-    def eval(self, direction: "mi.Vector3f", roughness: "mi.Float | None" = None) -> "mi.Color3f":
-        """Return linear radiance along world-space unit ``direction``, averaged over the lobe of ``roughness`` (None:
-        unfiltered)."""
-        longitude, colatitude = self._coordinates(direction)
+    def eval(
+        self,
+        direction: "mi.Vector3f",
+        roughness: "mi.Float | None" = None,
+        point: "mi.Point3f | None" = None,
+    ) -> "mi.Color3f":
+        """Return linear radiance that comes to ``point`` (world space) along world-space unit ``direction``, averaged over the
+        lobe of ``roughness`` (None: unfiltered), whose width on the map is that on the wall, as the map's center sees it:
+        r² becomes r²/s of (14) in `room.py`. ``point`` None is the room's center."""
+        local, farther, _ = self.environment.seen(direction, point)
+        longitude, colatitude = self._coordinates(local)
         if roughness is None:
             return self._level(longitude, colatitude, mi.UInt32(0))
+        if point is not None and self.environment.room is not None:
+            roughness = dr.minimum(roughness * dr.rsqrt(farther), 1)
         nodes = [r for r, _ in _prefilter.LEVELS]
         position = mi.Float(0)
         for low, high in zip(nodes[:-1], nodes[1:]):
@@ -153,6 +205,8 @@ class FilteredEnvironment:
             position - mi.Float(level),
         )
 
-    def eval_diffuse(self, normal: "mi.Vector3f") -> "mi.Color3f":
-        """Return radiance averaged over the cosine lobe around world-space unit ``normal``: irradiance by π."""
-        return self._level(*self._coordinates(normal), mi.UInt32(len(_prefilter.LEVELS)))
+    def eval_diffuse(self, normal: "mi.Vector3f", point: "mi.Point3f | None" = None) -> "mi.Color3f":
+        """Return radiance averaged over the cosine lobe around world-space unit ``normal`` at ``point`` (see `eval`):
+        irradiance by π."""
+        local, _, _ = self.environment.seen(normal, point)
+        return self._level(*self._coordinates(local), mi.UInt32(len(_prefilter.LEVELS)))

@@ -32,7 +32,7 @@ from .surface import Surface
 if TYPE_CHECKING:
     from .lighting import Lighting
 
-KINDS = ("none", "visibility", "one_bounce")
+KINDS = ("none", "visibility", "one_bounce", "two_bounces")
 _RAYS, _TURNS = 32, 8  # from each surfel, of (9); places about a turntable in which these see the light
 _BLUR = 0.5  # the roughness as whose lobe sees it the environment is taken there: few rays then see small lights, too
 
@@ -41,15 +41,18 @@ _BLUR = 0.5  # the roughness as whose lobe sees it the environment is taken ther
 class Indirect:
     """How surfels see each other.
 
-    kind                   what a ray brings from a surfel that it meets: nothing, or that surfel's radiance
+    kind                   what a ray brings from a surfel that it meets: nothing, or that surfel's radiance, which reflects the
+                           environment alone, or other surfels, too
     proxies                the quads that rays meet, perhaps of a few steps ago
     surfels                the surfels as they are
+    box                    in which they reflect light (None: everywhere); those beyond have their own radiance alone
     irradiance_visibility  a of (9), one entry per surfel (None: 1 for all)
     """
 
-    kind: Literal["visibility", "one_bounce"]
+    kind: Literal["visibility", "one_bounce", "two_bounces"]
     proxies: Proxies
     surfels: Surfels
+    box: BoundingBox | None = None
     irradiance_visibility: "mi.Color3f | None" = None
 
     def incident_radiance(
@@ -71,11 +74,15 @@ class Indirect:
         )
         indices = dr.compress(found)
         light = dr.zeros(mi.Color3f, dr.width(found))
-        if self.kind == "one_bounce" and dr.width(indices) > 0:
+        if self.kind != "visibility" and dr.width(indices) > 0:
             d = mi.Vector3f(*(dr.gather(mi.Float, c, indices, mode=dr.ReduceMode.NoConflicts) for c in direction))
             index, uv = dr.gather(mi.UInt32, index, indices), dr.gather(mi.Point2f, uv, indices)
             dr.scatter(light, self._radiance(index, uv, d, lighting), indices)
         return dr.select(found, dr.lerp(incoming, light, part), incoming)
+
+    def deeper(self) -> "Indirect | None":
+        """Return how surfels that a ray meets reflect others; None where they do not."""
+        return replace(self, kind="one_bounce") if self.kind == "two_bounces" else None
 
     def with_irradiance_visibility(self, lighting: "Lighting", seed: "mi.UInt32") -> "Indirect":
         """Return the same with `irradiance_visibility`, where surfels are lit by ``lighting``, whose estimator is the split
@@ -102,28 +109,39 @@ class Indirect:
             sample = index % each + dr.opaque(mi.UInt32, k * each)
             local = mi.warp.square_to_cosine_hemisphere(points(n, seed, surfel, sample)[0])
             direction = mi.Frame3f(normal).to_world(local)
-            incoming = light.estimator.environment.eval(direction, mi.Float(_BLUR))
+            incoming = light.estimator.environment.eval(direction, mi.Float(_BLUR), point)
             coming += total(self.incident_radiance(incoming, point, normal, direction, light))
             radiance += total(incoming)
             dr.eval(coming, radiance)
         return coming / dr.maximum(radiance, 1e-6)
 
-    def with_visibility_as_radiance(self, surfels: Surfels, box: BoundingBox | None) -> Surfels:
-        """Return ``surfels`` whose radiance is their `irradiance_visibility`, in the ``box`` (None: everywhere), to be
-        splatted. That must be known."""
+    def with_visibility_as_radiance(self, surfels: Surfels) -> Surfels:
+        """Return ``surfels`` whose radiance is their `irradiance_visibility`, in the `box`, to be splatted. That must be
+        known."""
         visibility = self.irradiance_visibility
         assert visibility is not None, "with_irradiance_visibility() comes first"
         shape = surfels.sh.shape
         sh, row = dr.copy(surfels.sh.array), dr.arange(mi.UInt32, len(surfels)) * shape[1]
-        inside = mi.Bool(True) if box is None else box.contains(surfels.column(mi.Point3f, "centers"))
+        inside = mi.Bool(True) if self.box is None else self.box.contains(surfels.column(mi.Point3f, "centers"))
         for k in range(shape[1]):
             dr.scatter(sh, (visibility[k] - 0.5) / SH_0 if k < 3 else mi.Float(0), row + k, inside)
         return replace(surfels, sh=mi.TensorXf(sh, shape))
 
     def _radiance(self, index, uv, direction, lighting):
-        """What the surfels ``index`` send against ``direction`` from ``uv`` on them; they in turn reflect the
-        environment alone."""
+        """What the surfels ``index`` send against ``direction`` from ``uv`` on them."""
         hit = self.surfels.take(index)
+        radiance = hit.radiance(direction)
+        if self.box is None:
+            return self._reflected(hit, index, uv, direction, radiance, lighting)
+        inside = dr.compress(self.box.contains(hit.column(mi.Point3f, "centers")))
+        if dr.width(inside) > 0:
+            at = lambda v: dr.gather(type(v), v, inside)
+            part = self._reflected(hit.take(inside), at(index), at(uv), at(direction), at(radiance), lighting)
+            dr.scatter(radiance, part, inside)
+        return radiance
+
+    def _reflected(self, hit, index, uv, direction, radiance, lighting):
+        """What the surfels ``hit``, those of the numbers ``index``, send of their own ``radiance`` and of the environment."""
         normal = hit.normals(uv)
         if hit.two_sided:
             normal = dr.mulsign(normal, -dr.dot(direction, normal))
@@ -134,10 +152,11 @@ class Indirect:
             hit.column(mi.Float, "roughness"),
             hit.column(mi.Float, "metallic"),
             hit.column(mi.Color3f, "base_color"),
+            hit.points(uv) if lighting.near else None,
         )
         specular = lighting.specular(surface)
         if not lighting.lit:
-            return hit.radiance(direction) + specular
+            return radiance + specular
         visibility = self.irradiance_visibility
         visibility = 1 if visibility is None else dr.gather(mi.Color3f, visibility, index)
         return lighting.diffuse(surface, irradiance_visibility=visibility) + specular

@@ -35,8 +35,13 @@ class Shading:
     samples: int = SAMPLES
     eta: float = DEFAULT_ETA
     box: BoundingBox | None = None
-    indirect: Literal["none", "visibility", "one_bounce"] = "none"
+    indirect: Literal["none", "visibility", "one_bounce", "two_bounces"] = "none"
     turntable: Turntable | None = None
+
+    def proxies(self, surfels: Surfels) -> Proxies:
+        """Return what rays meet that ``surfels`` reflect: each other, or what lies around the box, too, where that sends
+        light."""
+        return Proxies(surfels, box=self.box, beyond=self.indirect != "visibility")
 
 
 @dataclass
@@ -74,31 +79,32 @@ class Lighting:
         """Return the lighting as it stands to the surfels for cameras at azimuths ``angle``, radians; see `Turntable.turned`."""
         return self if self.turntable is None else self._turned(self.turntable.turned(angle))
 
-    def specular(self, surface: Surface, point: "mi.Point3f | None" = None) -> "mi.Color3f":
-        """Return f_φ(C_s), linear radiance that a `Surface` reflects towards its ``view``; see `SplitSum.specular`. `indirect`
-        needs its world-space ``point`` (None: it reflects the environment alone)."""
-        C_s = self.estimator.specular(surface, self._incident_radiance(surface, point))
+    @property
+    def near(self) -> bool:
+        """Whether it depends on where a `Surface` is what it reflects, so that it needs its ``point``."""
+        return self.indirect is not None or self.estimator.environment.environment.room is not None
+
+    def specular(self, surface: Surface) -> "mi.Color3f":
+        """Return f_φ(C_s), linear radiance that a `Surface` reflects towards its ``view``; see `SplitSum.specular`."""
+        C_s = self.estimator.specular(surface, self._incident_radiance(surface))
         return C_s if self.shader is None else self.shader(C_s, surface.roughness, surface.cosine)
 
-    def diffuse(
-        self,
-        surface: Surface,
-        point: "mi.Point3f | None" = None,
-        irradiance_visibility: "mi.Color3f | float" = 1,
-    ) -> "mi.Color3f":
+    def diffuse(self, surface: Surface, irradiance_visibility: "mi.Color3f | float" = 1) -> "mi.Color3f":
         """Return C_d of a lit `Surface`, as `specular` does C_s; ``irradiance_visibility`` is a of (9) in `indirect.py`."""
-        return self.estimator.diffuse(surface, self._incident_radiance(surface, point), irradiance_visibility)
+        return self.estimator.diffuse(surface, self._incident_radiance(surface), irradiance_visibility)
 
-    def _incident_radiance(self, surface, point) -> IncidentRadiance | None:
-        """The callback for a surface at ``point``; None where there is none."""
+    def _incident_radiance(self, surface) -> IncidentRadiance | None:
+        """The callback for a surface; None where it reflects the environment alone."""
+        indirect = self.indirect
+        if indirect is None:
+            return None
 
         def incident_radiance(light, direction, index):
-            assert self.indirect is not None, "surfaces have a point where they reflect each other"
             at = lambda v: v if index is None else dr.gather(type(v), v, index)
             part = 1 if self.lit else dr.clip((_WIDE - at(surface.roughness)) / (_WIDE - _NARROW), 0, 1)
-            return self.indirect.incident_radiance(light, at(point), at(surface.normal), direction, self, part)
+            return indirect.incident_radiance(light, at(surface.point), at(surface.normal), direction, self, part)
 
-        return None if point is None else incident_radiance
+        return incident_radiance
 
     @property
     def _with_visibility(self) -> Indirect | None:
@@ -115,27 +121,28 @@ class Lighting:
     def as_splatted(self, surfels: Surfels) -> Surfels:
         """Return the surfels to splat: what is lit has no radiance of its own, but its irradiance visibility in its place."""
         indirect = self._with_visibility
-        return surfels if indirect is None else indirect.with_visibility_as_radiance(surfels, self.box)
+        return surfels if indirect is None else indirect.with_visibility_as_radiance(surfels)
 
     def irradiance_visibility(self, maps: Maps, mean: "mi.Float") -> "mi.Color3f | float":
         """Return the irradiance visibility of pixels of these ``maps``, which ``mean`` divides by their coverage."""
         return 1 if self._with_visibility is None else maps.diffuse * mean
 
     def for_secondary_bounce(self) -> "Lighting":
-        """Return the lighting of what a reflected ray meets: it reflects the environment alone."""
-        return replace(self, estimator=self.estimator.for_secondary_bounce(), indirect=None)
+        """Return the lighting of what a reflected ray meets; see `Indirect.deeper`."""
+        deeper = self.indirect and self.indirect.deeper()
+        return replace(self, estimator=self.estimator.for_secondary_bounce(), indirect=deeper)
 
     def learned(self) -> list:
-        """Return the arrays that a fit changes: texels of the environment as the estimator has them, and the weights of the
+        """Return the arrays that a fit changes: those of the environment as the estimator has it, and the weights of the
         shader where there is one."""
-        return [self.estimator.environment.texels, *([self.shader.weights] if self.shader else [])]
+        return [*self.estimator.environment.learned(), *([self.shader.weights] if self.shader else [])]
 
     def with_learned(self, arrays: list, surfels: Surfels) -> "Lighting":
         """Return the same lighting with other ``arrays`` in place of `learned`, and for other ``surfels``, moved ones."""
         return replace(
             self,
-            estimator=self.estimator.with_texels(arrays[0]),
-            shader=self.shader and Shader(arrays[1]),
+            estimator=replace(self.estimator, environment=self.estimator.environment.with_learned(arrays)),
+            shader=self.shader and Shader(arrays[-1]),
             indirect=self.indirect and replace(self.indirect, surfels=surfels),
         )
 
@@ -172,8 +179,8 @@ def lighting_of(
         estimator = MonteCarlo(environment, emitter, shading.eta, shading.samples, random, paired)
     indirect = None
     if shading.indirect != "none":
-        proxies = Proxies(surfels, box=shading.box) if proxies is None else proxies
-        indirect = Indirect(shading.indirect, proxies, surfels, irradiance_visibility)
+        proxies = shading.proxies(surfels) if proxies is None else proxies
+        indirect = Indirect(shading.indirect, proxies, surfels, shading.box, irradiance_visibility)
     lighting = Lighting(estimator, shader, indirect, lit, shading.box, shading.turntable)
     # Where the light is sampled, its rays say by themselves what is hidden
     needs_visibility = lit and indirect is not None and not sampled and irradiance_visibility is None

@@ -67,10 +67,6 @@ class MonteCarlo:
         """Return the estimator of what a reflected ray meets: one sample is enough of what few rays see."""
         return replace(self, samples=1, seed=self.seed ^ _DEEPER, paired=False)
 
-    def with_texels(self, texels: "mi.Float") -> "MonteCarlo":
-        """Return the same estimator with other ``texels`` of its `FilteredEnvironment`."""
-        return replace(self, environment=replace(self.environment, texels=texels))
-
     def _integral(self, lobe, surface, incident_radiance):
         if self.paired:
             derivatives = replace(self, paired=False)._integral(lobe, surface, incident_radiance)
@@ -90,31 +86,30 @@ class MonteCarlo:
         index = dr.arange(mi.UInt32, n * count)
         pixel, sample = index // count, index % count + dr.opaque(mi.UInt32, first)
         dr.eval(*surface)
-        normal, view, roughness, metallic, base_color = _spread(surface, count)
+        normal, view, roughness, metallic, base_color, *point = _spread([v for v in surface if v is not None], count)
+        point = point[0] if point else None
         material = lobe(roughness, metallic, base_color, self.eta)
         si = _interaction(normal, view)
         of_light, of_lobe = points(n, self.seed, pixel, sample, sets=2)
-        lit, turn = self.emitter.sample_direction(si, of_light)[0].d, self.environment.environment.turn
-        if turn is not None:
-            lit = turn.T @ lit
+        lit = self.environment.environment.seen_from(self.emitter.sample_direction(si, of_light)[0].d, point)
         bounced = si.to_world(material.sample(si, mi.Float(0.5), of_lobe))
         total = mi.Color3f(0)
         for direction in (dr.detach(lit), bounced):
             local = si.to_local(direction)
-            light = self.environment.eval(direction)
+            light = self.environment.eval(direction, point=point)
             if incident_radiance is not None:
                 light = incident_radiance(light, direction, pixel)
-            density = material.pdf(si, local) + self._emitter_pdf(si, direction)
+            density = material.pdf(si, local) + self._emitter_pdf(si, direction, point)
             g = material.eval(si, local) * light / density
             total += dr.select((density > 0) & (local.z > 0), g, 0)
         dr.eval(total)  # all channels in one kernel
         return mi.Color3f(*(dr.block_sum(c, count) for c in total))
 
-    def _emitter_pdf(self, si, direction):
+    def _emitter_pdf(self, si, direction, point):
         ds = dr.zeros(mi.DirectionSample3f, dr.width(direction))
-        turn = self.environment.environment.turn
-        ds.d = direction if turn is None else turn @ direction
-        return self.emitter.pdf_direction(si, ds)
+        local, _, density = self.environment.environment.seen(direction, point)
+        ds.d = self.environment.environment.to_world(local)
+        return self.emitter.pdf_direction(si, ds) * density
 
 
 @functools.lru_cache(maxsize=4)

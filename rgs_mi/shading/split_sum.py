@@ -6,7 +6,7 @@ with P the environment averaged over the BSDF's lobe seen along the normal (`pre
 seen from elsewhere ((8) of `taps.py`), and E its albedo ((4) of `tables.py`).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -34,13 +34,13 @@ class SplitSum:
 
         ``incident_radiance``: callback that returns incident radiance after occlusion; None means the unoccluded environment.
         """
-        normal, view, roughness, metallic, base_color = surface
+        normal, view, roughness, metallic, base_color, point = surface
         cosine = surface.cosine
         reflected = 2 * cosine * normal - view
         E, phi = albedo(cosine, roughness, metallic, base_color, self.eta)
         incoming = mi.Color3f(0)
         for a, r, w in taps(cosine, roughness, phi, self.entries):
-            incoming += w * self.environment.eval(dr.normalize(reflected + a * normal), r)
+            incoming += w * self.environment.eval(dr.normalize(reflected + a * normal), r, point)
         if incident_radiance is not None:
             incoming = incident_radiance(incoming, reflected, None)
         return incoming * E
@@ -54,16 +54,12 @@ class SplitSum:
         """Return C_d of the diffuse lobe, as `specular` does C_s. It receives the part ``irradiance_visibility`` of the light
         ((9) of `indirect.py`); ``incident_radiance`` is not called, since that lobe has no one direction."""
         E = _table(surface.cosine, surface.roughness, (3,), self.eta)[0]
-        received = self.environment.eval_diffuse(surface.normal) * irradiance_visibility
+        received = self.environment.eval_diffuse(surface.normal, surface.point) * irradiance_visibility
         return received * E * (1 - surface.metallic) * surface.base_color
 
     def for_secondary_bounce(self) -> "SplitSum":
         """Return the estimator of what a reflected ray meets: this one."""
         return self
-
-    def with_texels(self, texels: "mi.Float") -> "SplitSum":
-        """Return the same estimator with other ``texels`` of its `FilteredEnvironment`."""
-        return replace(self, environment=replace(self.environment, texels=texels))
 
 
 def albedo(

@@ -11,6 +11,7 @@ class Surface(NamedTuple):
 
     normal, view  unit vectors in world space, ``view`` from the surface to the camera
     roughness, metallic, base_color   parameters of the principled BSDF
+    point         where they are in world space; None where neither what reflects nor a room is near
     """
 
     normal: "mi.Vector3f"
@@ -18,6 +19,7 @@ class Surface(NamedTuple):
     roughness: "mi.Float"
     metallic: "mi.Float"
     base_color: "mi.Color3f"
+    point: "mi.Point3f | None" = None
 
     @property
     def cosine(self) -> "mi.Float":

@@ -125,6 +125,12 @@ class Surfels:
             normal = normal + uv.x * dn_du + uv.y * dn_dv
         return dr.normalize(normal)
 
+    def points(self, uv: "mi.Point2f") -> "mi.Point3f":
+        """Return the points ``uv`` of the surfels, in standard deviations from their centers, in world space, of width N."""
+        t_u, t_v, _ = self.frames()
+        scale = self.column(mi.Vector2f, "scales")
+        return self.column(mi.Point3f, "centers") + uv.x * scale.x * t_u + uv.y * scale.y * t_v
+
     def radiance(self, direction: "mi.Vector3f") -> "mi.Color3f":
         """Return the diffuse radiance (linear) of every surfel seen along the world-space unit ``direction`` from the camera,
         of width N."""

@@ -13,7 +13,7 @@ from rgs_mi.priors.initialization import surroundings
 from rgs_mi.settings.settings import Density
 from rgs_mi.shading import deferred
 from rgs_mi.shading.environment import Environment
-from rgs_mi.shading.lighting import Lighting
+from rgs_mi.shading.lighting import Lighting, Shading, lighting_of
 from rgs_mi.shading.split_sum import SplitSum
 from rgs_mi.surfels.proxies import Proxies
 from rgs_mi.surfels.surfels import CHANNELS
@@ -92,6 +92,28 @@ def test_rays_meet_what_is_in_the_box():
         hit[box] = centers[number.numpy()[found.numpy()], 1]
         assert len(hit[box]) > 500
     assert (hit[BOX] <= 0).all() and (hit[None] > 0).mean() > 0.3
+
+
+def test_what_lies_beyond_the_box_is_reflected_as_it_was_photographed():
+    """A mirror in the box shows surfels around it, of their own radiance alone; those in the box reflect light, too."""
+    surfels = sphere_surfels(300, scale=0.9, opacity_shift=3)
+    texels = np.random.default_rng(0).random((8, 16, 3), np.float32)
+    environment = Environment(mi.TensorXf(texels), np.eye(3)).filtered()
+    lighting = lighting_of(Shading(indirect="one_bounce", box=BOX), surfels, environment)
+    centers = surfels.numpy()["centers"]
+    found, index, uv = lighting.indirect.proxies.intersect(
+        mi.Point3f((3 * centers).T), mi.Vector3f(0), mi.Vector3f(-centers.T)
+    )
+    light = lighting.indirect._radiance(index, uv, mi.Vector3f(-centers.T), lighting).numpy().T
+    own = surfels.take(index).radiance(mi.Vector3f(-centers.T)).numpy().T
+    number = index.numpy()
+    beyond, met = centers[number, 1] > 0, found.numpy()
+    assert min((beyond & met).sum(), (~beyond & met).sum()) > 50
+    np.testing.assert_array_equal(light[beyond & met], own[beyond & met])
+    assert abs(light - own)[~beyond & met].mean() > 0.02
+    everywhere = lighting_of(Shading(indirect="one_bounce"), surfels, environment)
+    whole = everywhere.indirect._radiance(index, uv, mi.Vector3f(-centers.T), everywhere).numpy().T
+    np.testing.assert_allclose(light[~beyond & met], whole[~beyond & met], atol=1e-6)
 
 
 def test_in_scenes():

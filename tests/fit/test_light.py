@@ -19,6 +19,7 @@ from rgs_mi.core.scene_files import find_scene, load_scene
 from rgs_mi.core.turntable import Turntable
 from rgs_mi.datasets.path_traced import train_directions
 from rgs_mi.datasets.types import Dataset, View
+from rgs_mi.export.relight import relight
 from rgs_mi.export.render import straight
 from rgs_mi.fit import light, losses
 from rgs_mi.fit.trainer import Fit
@@ -154,6 +155,27 @@ def test_a_run_says_that_its_object_turns(tmp_path, monkeypatch, capfd):
         shown = image[..., :3] * image[..., 3:] + 1 - image[..., 3:]
         written_by_run = np.asarray(Image.open(run / "test" / f"{sensor.id()}.png"), float)[..., :3] / 255
         assert np.abs(shown - written_by_run).mean() < 4e-3
+
+
+def test_a_run_in_a_room(tmp_path):
+    """Walls are learned, go on where they were, and stand in the scene that a run leaves behind."""
+    still = ["light=world", "initialization.surfels=400", "initialization.compare=false", "spp=1", "room=3"]
+    scene, data = find_scene("object", "scenes"), written(tmp_path / "ball")
+    run = optimize(scene, data=data, out=tmp_path / "run", overrides=[*still, "iterations=40"])
+    walls = json.loads((run / "metrics.json").read_text())["room"]["distances"]
+    assert len(set(walls.values())) == 6 and all(1 < d < 9 for d in walls.values())
+    first = load_scene(run / "scene.xml", {})
+    assert first.integrator().room.distances == pytest.approx(list(walls.values()), rel=1e-4)
+    sensor = first.sensors()[0]
+    image = straight(np.array(mi.render(first, sensor=sensor, spp=1)))
+    shown = image[..., :3] * image[..., 3:] + 1 - image[..., 3:]
+    written_by_run = np.asarray(Image.open(run / "test" / f"{sensor.id()}.png"), float)[..., :3] / 255
+    assert np.abs(shown - written_by_run).mean() < 4e-3
+    optimize(scene, data=data, out=run, overrides=[*still, "iterations=41"], resume=True)
+    later = json.loads((run / "metrics.json").read_text())["room"]["distances"]
+    assert all(abs(later[side] / walls[side] - 1) < 0.05 for side in walls)
+    relight(first, run / "scene.xml", envmap="studio")
+    assert first.integrator().room is None
 
 
 def test_bad_settings():

@@ -144,7 +144,7 @@ def test_paired_estimates_free_the_squared_error_of_noise_bias():
         dr.eval(roughness)
         leaf = mi.Float(dr.detach(roughness))
         dr.enable_grad(leaf)
-        normal, view, _, metallic, color = (dr.detach(v) for v in arguments)
+        normal, view, _, metallic, color = (dr.detach(v) for v in arguments[:5])
         spread = lambda v: dr.gather(type(v), v, index)
         C = estimator(environment, samples, 1, paired=paired).specular(
             Surface(spread(normal), spread(view), leaf, spread(metallic), spread(color))
