@@ -24,14 +24,13 @@ what a principled BSDF with the G-buffer's material reflects of the environment 
  * - indirect
    - |string|
    - What a reflected ray that meets a surfel brings: ``none``, the environment behind it; ``visibility``, nothing;
-     ``one_bounce``, the surfel's own radiance, which in turn reflects the environment alone, or with ``two_bounces`` other
-     surfels. Where the diffuse radiance is
+     ``one_bounce``, the surfel's own radiance, which in turn reflects the environment alone. Where the diffuse radiance is
      ``lit``, the same holds for its light (Default: ``none``)
 
  * - box
    - |string|
-   - Six numbers, lower and upper corner: only what lies in this box reflects light. What lies
-     beyond, the surroundings in a capture without masks, has its diffuse radiance alone (Default: none, everything)
+   - Six numbers, lower and upper corner: only what lies in this box reflects light. What lies beyond, the surroundings in a
+     capture without masks, has its diffuse radiance alone, also in reflections, with ``one_bounce`` (Default: none, everything)
 
  * - turntable
    - |string|

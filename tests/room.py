@@ -1,8 +1,8 @@
 """A shiny object in a room that photographs show, without masks and points: what phones make of it.
 
-``python tests/room.py DATA`` path-traces the helmet in a closed room, with textures on its walls, into a capture in
-nerfstudio's layout, which fits take for photographs, without masks; silhouettes in them lie beside them. ``--masked FROM`` takes
-the photographs that lie in FROM, with their silhouettes as masks.
+``python tests/room.py DATA`` path-traces the helmet, or another ``--object`` of the suite, in a closed room, with textures on
+its walls, into a capture in nerfstudio's layout, which fits take for photographs, without masks; silhouettes in them lie beside
+them. ``--masked FROM`` takes the photographs that lie in FROM, with their silhouettes as masks.
 ``rgs-mi optimize object --data DATA --out RUN --minutes 10`` fits it, and ``python tests/room.py DATA --score RUN`` prints
 how good RUN is within the object's silhouette.
 """
@@ -27,7 +27,7 @@ from rgs_mi.core.progress import Progress
 from rgs_mi.core.scene_files import load_scene
 from rgs_mi.datasets.path_traced import _CV_TO_BLENDER, FOV, Renderer, bounds
 
-HELMET = Path(__file__).parents[1] / "scenes" / "targets" / "helmet.xml"
+TARGETS = Path(__file__).parents[1] / "scenes" / "targets"
 COUNTS, SIZE, SPP = {"train": 60, "test": 8}, 400, 64  # test views take twice the samples
 SIDE, HEIGHT = 4.4, 5.0  # of the room: half its width, and its height, in radii of the object
 DISTANCE = 1.25  # of the cameras, over that at which the object fills the frame
@@ -91,12 +91,12 @@ def directions(count, split):
     return np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], -1)
 
 
-def render(out):
+def render(target, out):
     """Write the data set; what is there already stays."""
-    helmet = load_scene(HELMET, {})
-    center, radius = bounds(helmet)
-    floor = float(np.array(helmet.bbox().min).ravel()[2])
-    shapes = {f"object{k}": shape for k, shape in enumerate(helmet.shapes())}
+    scene = load_scene(TARGETS / f"{target}.xml", {})
+    center, radius = bounds(scene)
+    floor = float(np.array(scene.bbox().min).ravel()[2])
+    shapes = {f"object{k}": shape for k, shape in enumerate(scene.shapes())}
     scene = mi.load_dict(
         {"type": "scene", "integrator": {"type": "path", "max_depth": 6}, **shapes, **room(center, radius, floor)}
     )
@@ -157,6 +157,7 @@ def score(data, run):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
+    parser.add_argument("--object", default="helmet")
     parser.add_argument("--masked", type=Path, metavar="FROM")
     parser.add_argument("--score", type=Path, metavar="RUN")
     args = parser.parse_args()
@@ -166,7 +167,7 @@ def main():
     elif args.masked:
         mask(args.masked, args.data)
     else:
-        render(args.data)
+        render(args.object, args.data)
 
 
 if __name__ == "__main__":

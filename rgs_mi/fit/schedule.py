@@ -90,6 +90,8 @@ class Schedule:
         s = self.settings
         rates = {name: self.value(getattr(s.learning_rates, _RATES[name]), progress) for name in names}
         rates["centers"] *= extent
+        if ROOM in rates and progress < s.refine_start:
+            rates[ROOM] = 0.0  # of a light that is a blur yet all walls come near, to give it shape
         # A light that has no shape yet would turn normals that the hull has right. Two-sided surfels began at random.
         if progress < s.normals_start and not two_sided:
             rates |= {name: _HELD * rates[name] for name in _NORMALS}

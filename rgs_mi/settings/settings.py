@@ -245,7 +245,7 @@ class Settings:
     shader: Literal["identity", "mlp"] = Field(
         default="identity", description="f_φ of C = C_d + f_φ(C_s): nothing, or a tiny network trained along."
     )
-    indirect: Literal["none", "visibility", "one_bounce", "two_bounces"] = Field(
+    indirect: Literal["none", "visibility", "one_bounce"] = Field(
         default="one_bounce", description="What reflected rays that meet surfels bring."
     )
     indirect_start: float = Field(
@@ -276,8 +276,8 @@ class Settings:
         default=None,
         gt=0,
         le=1e6,
-        description="The light is painted on the walls of a room, so many radii of the object from its middle at first; then "
-        "they are learned. Unless given, it is at infinity.",
+        description="The light is painted on the walls of a room, so many radii of the object from its middle at first; from "
+        "`refine_start` on they are learned. Unless given, it is at infinity.",
     )
     cameras: Literal["fixed", "learned"] = Field(
         default="fixed",

@@ -32,7 +32,7 @@ from .surface import Surface
 if TYPE_CHECKING:
     from .lighting import Lighting
 
-KINDS = ("none", "visibility", "one_bounce", "two_bounces")
+KINDS = ("none", "visibility", "one_bounce")
 _RAYS, _TURNS = 32, 8  # from each surfel, of (9); places about a turntable in which these see the light
 _BLUR = 0.5  # the roughness as whose lobe sees it the environment is taken there: few rays then see small lights, too
 
@@ -41,15 +41,14 @@ _BLUR = 0.5  # the roughness as whose lobe sees it the environment is taken ther
 class Indirect:
     """How surfels see each other.
 
-    kind                   what a ray brings from a surfel that it meets: nothing, or that surfel's radiance, which reflects the
-                           environment alone, or other surfels, too
+    kind                   what a ray brings from a surfel that it meets: nothing, or that surfel's radiance
     proxies                the quads that rays meet, perhaps of a few steps ago
     surfels                the surfels as they are
     box                    in which they reflect light (None: everywhere); those beyond have their own radiance alone
     irradiance_visibility  a of (9), one entry per surfel (None: 1 for all)
     """
 
-    kind: Literal["visibility", "one_bounce", "two_bounces"]
+    kind: Literal["visibility", "one_bounce"]
     proxies: Proxies
     surfels: Surfels
     box: BoundingBox | None = None
@@ -74,15 +73,11 @@ class Indirect:
         )
         indices = dr.compress(found)
         light = dr.zeros(mi.Color3f, dr.width(found))
-        if self.kind != "visibility" and dr.width(indices) > 0:
+        if self.kind == "one_bounce" and dr.width(indices) > 0:
             d = mi.Vector3f(*(dr.gather(mi.Float, c, indices, mode=dr.ReduceMode.NoConflicts) for c in direction))
             index, uv = dr.gather(mi.UInt32, index, indices), dr.gather(mi.Point2f, uv, indices)
             dr.scatter(light, self._radiance(index, uv, d, lighting), indices)
         return dr.select(found, dr.lerp(incoming, light, part), incoming)
-
-    def deeper(self) -> "Indirect | None":
-        """Return how surfels that a ray meets reflect others; None where they do not."""
-        return replace(self, kind="one_bounce") if self.kind == "two_bounces" else None
 
     def with_irradiance_visibility(self, lighting: "Lighting", seed: "mi.UInt32") -> "Indirect":
         """Return the same with `irradiance_visibility`, where surfels are lit by ``lighting``, whose estimator is the split
@@ -128,7 +123,8 @@ class Indirect:
         return replace(surfels, sh=mi.TensorXf(sh, shape))
 
     def _radiance(self, index, uv, direction, lighting):
-        """What the surfels ``index`` send against ``direction`` from ``uv`` on them."""
+        """What the surfels ``index`` send against ``direction`` from ``uv`` on them; they in turn reflect the environment
+        alone."""
         hit = self.surfels.take(index)
         radiance = hit.radiance(direction)
         if self.box is None:

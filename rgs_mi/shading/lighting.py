@@ -35,13 +35,13 @@ class Shading:
     samples: int = SAMPLES
     eta: float = DEFAULT_ETA
     box: BoundingBox | None = None
-    indirect: Literal["none", "visibility", "one_bounce", "two_bounces"] = "none"
+    indirect: Literal["none", "visibility", "one_bounce"] = "none"
     turntable: Turntable | None = None
 
     def proxies(self, surfels: Surfels) -> Proxies:
         """Return what rays meet that ``surfels`` reflect: each other, or what lies around the box, too, where that sends
         light."""
-        return Proxies(surfels, box=self.box, beyond=self.indirect != "visibility")
+        return Proxies(surfels, box=self.box, beyond=self.indirect == "one_bounce")
 
 
 @dataclass
@@ -128,9 +128,8 @@ class Lighting:
         return 1 if self._with_visibility is None else maps.diffuse * mean
 
     def for_secondary_bounce(self) -> "Lighting":
-        """Return the lighting of what a reflected ray meets; see `Indirect.deeper`."""
-        deeper = self.indirect and self.indirect.deeper()
-        return replace(self, estimator=self.estimator.for_secondary_bounce(), indirect=deeper)
+        """Return the lighting of what a reflected ray meets: it reflects the environment alone."""
+        return replace(self, estimator=self.estimator.for_secondary_bounce(), indirect=None)
 
     def learned(self) -> list:
         """Return the arrays that a fit changes: those of the environment as the estimator has it, and the weights of the
