@@ -4,11 +4,11 @@ A viewer knows no light. So each surfel is shaded, by the scene's own `Lighting`
 the sphere, seen from all of those in front of it, and its clipped display colours c_k are fitted by spherical harmonics of third
 degree (`splats.py`), in weighted and regularised least squares:
 
-    min Σ_k w_k |½ + Σ_j sh_j Y_j(−ω_k) − c_k|² / Σ_k w_k + λ Σ_j (l_j (l_j + 1))² |sh_j|²                   (14)
+    min Σ_k w_k |½ + Σ_j sh_j Y_j(−ω_k) − c_k|² / Σ_k w_k + λ Σ_{j>0} |sh_j|²                        (14)
 
 w_k is the area that the surfel shows, times how densely cameras look from there, times next to nothing where other surfels hide
-it. So (14) is the error of pictures, but for how surfels blend. The penalty, of the Laplacian on the sphere, is for
-directions that nobody looks from.
+it. So (14) is the error of pictures, but for how surfels blend. The penalty keeps coefficients small, also where nobody looks
+from: viewers hold them in eight bits, for numbers from −1 to 1, and cut off the rest.
 """
 
 import sys
@@ -33,7 +33,8 @@ from .splats import COEFFICIENTS, Splats, fibonacci_sphere, sh_basis
 DIRECTIONS = 192  # K
 _LANES = 2**19  # surfels times directions at a time
 _HIDDEN = 0.01  # part of its weight that a direction keeps where other surfels hide a surfel
-_SMOOTH = 2e-6  # λ
+_PENALTY = 1e-3  # λ
+_TINY = 1e-8  # the constant's, so that a surfel that nothing is known of has a colour
 _ELSEWHERE = 0.1  # part of the weight that is spread over all directions, whatever the cameras
 
 
@@ -66,11 +67,10 @@ def fit(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return the coefficients [n, 16, 3] float32 of (14), of display ``colors`` [n, K, 3] seen from the directions ω_k of
     `fibonacci_sphere` with ``weights`` [n, K]. Where all of these are zero the colour is a middle grey."""
     basis = sh_basis(-fibonacci_sphere(weights.shape[1]))
-    degree = np.floor(np.sqrt(np.arange(COEFFICIENTS)))
     weights = weights / np.maximum(weights.sum(1, keepdims=True), 1e-12)
     products = (basis[:, :, None] * basis[:, None]).reshape(len(basis), -1)
     normal = (weights @ products).reshape(-1, COEFFICIENTS, COEFFICIENTS)
-    normal += np.diag(_SMOOTH * (degree * (degree + 1)) ** 2 + 1e-8)
+    normal += np.diag([_TINY] + [_PENALTY] * (COEFFICIENTS - 1))
     moments = np.moveaxis((weights[:, :, None] * (colors - 0.5)).swapaxes(1, 2) @ basis, 1, 2)
     return np.linalg.solve(normal, moments).astype(np.float32)
 
