@@ -4,10 +4,10 @@ A viewer knows no light. So each surfel is shaded, by the scene's own `Lighting`
 the sphere, seen from all of those in front of it, and its clipped display colours c_k are fitted by spherical harmonics of third
 degree (`splats.py`), in weighted and regularised least squares:
 
-    min Σ_k w_k |½ + Σ_j sh_j Y_j(−ω_k) − c_k|² / Σ_k w_k + λ Σ_{j>0} |sh_j|²                        (14)
+    min Σ_k w_k |½ + Σ_j sh_j Y_j(−ω_k) − c_k|² / Σ_k w_k + λ Σ_{j>0} |sh_j|²                        (15)
 
 w_k is the area that the surfel shows, times how densely cameras look from there, times next to nothing where other surfels hide
-it. So (14) is the error of pictures, but for how surfels blend. The penalty keeps coefficients small, also where nobody looks
+it. So (15) is the error of pictures, but for how surfels blend. The penalty keeps coefficients small, also where nobody looks
 from: viewers hold them in eight bits, for numbers from −1 to 1, and cut off the rest.
 """
 
@@ -24,10 +24,7 @@ from ..core.color import srgb_encode
 from ..core.errors import UserError
 from ..core.progress import Progress
 from ..plugins import lit_surfels
-from ..shading.lighting import Lighting
-from ..shading.surface import Surface
 from ..surfels.proxies import Proxies
-from ..surfels.surfels import Surfels
 from .splats import COEFFICIENTS, Splats, fibonacci_sphere, sh_basis
 
 DIRECTIONS = 192  # K
@@ -64,7 +61,7 @@ def bake(scene: "mi.Scene", path: str | Path, quiet: bool = False) -> Splats:
 
 
 def fit(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the coefficients [n, 16, 3] float32 of (14), of display ``colors`` [n, K, 3] seen from the directions ω_k of
+    """Return the coefficients [n, 16, 3] float32 of (15), of display ``colors`` [n, K, 3] seen from the directions ω_k of
     `fibonacci_sphere` with ``weights`` [n, K]. Where all of these are zero the colour is a middle grey."""
     basis = sh_basis(-fibonacci_sphere(weights.shape[1]))
     weights = weights / np.maximum(weights.sum(1, keepdims=True), 1e-12)
@@ -76,7 +73,7 @@ def fit(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _seen(surfels, lighting, cameras, count) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """(colours [n, K, 3], weights [n, K] of (14)), of some surfels after others; ``cameras`` are ``count`` positions."""
+    """(colours [n, K, 3], weights [n, K] of (15)), of some surfels after others; ``cameras`` are ``count`` positions."""
     proxies = Proxies(surfels, box=None if lighting is None else lighting.box)
     directions = mi.Vector3f(np.float32(fibonacci_sphere(DIRECTIONS).T))
     dr.eval(directions, cameras)
@@ -97,7 +94,7 @@ def _seen(surfels, lighting, cameras, count) -> Iterator[tuple[np.ndarray, np.nd
         center = some.column(mi.Point3f, "centers")
         hidden, _, _ = proxies.intersect(center, dr.mulsign(some.frames()[2], cosine), view)
         weight = area * dr.select(hidden, _HIDDEN, 1) * _density(view, center, cameras, count)
-        color = radiance(some, surfel, view, lighting)
+        color = _radiance(some, surfel, view, lighting)
         colors, weights = dr.zeros(mi.Color3f, n * DIRECTIONS), dr.zeros(mi.Float, n * DIRECTIONS)
         dr.scatter(colors, color, index)
         dr.scatter(weights, weight, index)
@@ -105,25 +102,13 @@ def _seen(surfels, lighting, cameras, count) -> Iterator[tuple[np.ndarray, np.nd
         yield srgb_encode(np.clip(linear, 0, 1)), np.array(weights).reshape(n, DIRECTIONS)
 
 
-def radiance(surfels: Surfels, index: "mi.UInt32", view: "mi.Vector3f", lighting: Lighting | None) -> "mi.Color3f":
-    """Return the linear radiance that ``surfels`` send along unit ``view``, in world space, from their centers, one entry each;
-    ``index`` is where they are among those of the ``lighting`` (None: diffuse radiance alone)."""
-    own = surfels.radiance(-view)
+def _radiance(surfels, index, view, lighting):
+    """The linear radiance that ``surfels``, those of the numbers ``index``, send along ``view`` from their centers."""
     if lighting is None:
-        return own
-    normal, center = surfels.normals(), surfels.column(mi.Point3f, "centers")
-    if surfels.two_sided:
-        normal = dr.mulsign(normal, dr.dot(surfels.frames()[2], view))
-    material = [surfels.column(mi.Float, name) for name in ("roughness", "metallic")]
-    surface = Surface(normal, view, *material, surfels.column(mi.Color3f, "base_color"))
-    point = None if lighting.indirect is None else center
-    specular, diffuse = lighting.specular(surface, point), own
-    if lighting.lit:
-        visibility = None if lighting.indirect is None else lighting.indirect.irradiance_visibility
-        visibility = 1 if visibility is None else dr.gather(mi.Color3f, visibility, index)
-        diffuse = lighting.diffuse(surface, point, visibility)
-    inside = True if lighting.box is None else lighting.box.contains(center)
-    return dr.select(inside, diffuse + specular, own)
+        return surfels.radiance(-view)
+    visibility = None if lighting.indirect is None or not lighting.lit else lighting.indirect.irradiance_visibility
+    visibility = 1 if visibility is None else dr.gather(mi.Color3f, visibility, index)
+    return lighting.radiance(surfels, dr.zeros(mi.Point2f, len(surfels)), view, visibility)
 
 
 def _density(view, center, cameras, count):
