@@ -2,7 +2,8 @@
 
 ``python tests/splat_viewers.py RUN [--views 10] [--size W] [--data DIR] [--out DIR]`` exports PLY and GLB, draws them in a
 headless Chromium, and prints the PSNR of each view over white. Views are the run's own test views, or, where ``--data``
-names the capture that it was fitted to, photographs of that: cameras that baking has not seen. ``--out`` keeps the pairs of pictures.
+names the capture that it was fitted to, photographs of that: cameras that baking has not seen. ``--out``
+keeps the pairs of pictures.
 """
 
 import argparse
