@@ -3,6 +3,7 @@
 import builtins
 import json
 import shutil
+import struct
 
 import mitsuba as mi
 import numpy as np
@@ -153,22 +154,29 @@ def test_khronos_validator(run, tmp_path):
         return [m for m in messages if m not in named and not (m["code"] == "UNSUPPORTED_EXTENSION" and known(m))]
 
     assert others(path) == []
+    for spoil in (_wrong_bound, _too_many):
+        assert [m for m in others(_spoiled(path, spoil)) if m["severity"] == 0]
+
+
+def _wrong_bound(document):
+    document["accessors"][0]["max"][0] += 1
+
+
+def _too_many(document):
+    document["accessors"][4]["count"] += 1
+
+
+def _spoiled(path, change):
+    """A copy of a GLB whose JSON ``change`` has changed."""
     data = path.read_bytes()
-    for old, new in ((b'"max":[', b'"max":[1'), (b'"type":"VEC4"', b'"type":"VEC3"'), (b'"count":300', b'"count":400')):
-        assert old in data
-        spoiled = tmp_path / "spoiled.glb"
-        spoiled.write_bytes(data.replace(old, new.ljust(len(old)), 1) if len(new) == len(old) else _resized(data, old, new))
-        assert [m for m in others(spoiled) if m["severity"] == 0]
-
-
-def _resized(data, old, new):
-    """A GLB whose JSON has ``new`` in place of the first ``old``, of another length: the chunk's blanks make up for it."""
-    size = int.from_bytes(data[12:16], "little")
-    text = data[20 : 20 + size].replace(old, new, 1)
-    text = text.rstrip() + b" " * (-len(text.rstrip()) % 4)
-    grown = len(text) - size
-    length = (len(data) + grown).to_bytes(4, "little")
-    return data[:8] + length + len(text).to_bytes(4, "little") + data[16:20] + text + data[20 + size :]
+    end = 20 + int.from_bytes(data[12:16], "little")
+    change(document := json.loads(data[20:end]))
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    sizes = struct.pack("<II", 20 + len(text) + len(data) - end, len(text))
+    path = path.with_stem("spoiled")
+    path.write_bytes(data[:8] + sizes + b"JSON" + text + data[end:])
+    return path
 
 
 def test_splat_transform_reads_the_ply(run, tmp_path):
