@@ -62,6 +62,7 @@ def babylon(path: Path):
         path.name: path,
     }
     with open_tab(webgl=True) as page:
+        page.set_default_timeout(1000 * _SECONDS)
         page.route(f"{_SITE}**", lambda route: _fulfill(route, files))
         page.goto(_SITE + "viewer.html")
         page.evaluate("(file) => load(file)", path.name)
