@@ -7,6 +7,7 @@ vertex in the header's order. What a file may hold behind its vertices, such as 
 import os
 import re
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -56,15 +57,24 @@ def names_of(vertices: np.ndarray) -> tuple[str, ...]:
     return vertices.dtype.names or ()
 
 
-def write_vertices(path: str | Path, vertices: np.ndarray) -> None:
-    """Write a structured array [N], with a field a property, as the vertices of a binary little-endian PLY; the file appears
-    whole or not at all.
+def write_vertices(path: str | Path, vertices: np.ndarray, comments: Sequence[str] = ()) -> None:
+    """Write a structured array [N], with a field a property, as the vertices of a binary little-endian PLY, with ``comments``
+    in its header; the file appears whole or not at all.
 
     Raises: UserError where the disk is full or the folder can't be written.
     """
     little = vertices.astype(vertices.dtype.newbyteorder("<"))
     properties = [f"property {_NAMES[little.dtype[name].str[1:]]} {name}" for name in names_of(little)]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(little)}", *properties, "end_header", ""]
+    told = [f"comment {comment}" for comment in comments]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *told,
+        f"element vertex {len(little)}",
+        *properties,
+        "end_header",
+        "",
+    ]
     with atomic_file(path) as stream:
         stream.write("\n".join(header).encode("ascii"))
         stream.write(little.tobytes())

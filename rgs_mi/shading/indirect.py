@@ -27,7 +27,6 @@ from ..core.bounding_box import BoundingBox
 from ..surfels.proxies import Proxies
 from ..surfels.surfels import SH_0, Surfels
 from .sequence import points
-from .surface import Surface
 
 if TYPE_CHECKING:
     from .lighting import Lighting
@@ -125,34 +124,6 @@ class Indirect:
     def _radiance(self, index, uv, direction, lighting):
         """What the surfels ``index`` send against ``direction`` from ``uv`` on them; they in turn reflect the environment
         alone."""
-        hit = self.surfels.take(index)
-        radiance = hit.radiance(direction)
-        if self.box is None:
-            return self._reflected(hit, index, uv, direction, radiance, lighting)
-        inside = dr.compress(self.box.contains(hit.column(mi.Point3f, "centers")))
-        if dr.width(inside) > 0:
-            at = lambda v: dr.gather(type(v), v, inside)
-            part = self._reflected(hit.take(inside), at(index), at(uv), at(direction), at(radiance), lighting)
-            dr.scatter(radiance, part, inside)
-        return radiance
-
-    def _reflected(self, hit, index, uv, direction, radiance, lighting):
-        """What the surfels ``hit``, those of the numbers ``index``, send of their own ``radiance`` and of the environment."""
-        normal = hit.normals(uv)
-        if hit.two_sided:
-            normal = dr.mulsign(normal, -dr.dot(direction, normal))
-        lighting = lighting.for_secondary_bounce()
-        surface = Surface(
-            normal,
-            -direction,
-            hit.column(mi.Float, "roughness"),
-            hit.column(mi.Float, "metallic"),
-            hit.column(mi.Color3f, "base_color"),
-            hit.points(uv) if lighting.near else None,
-        )
-        specular = lighting.specular(surface)
-        if not lighting.lit:
-            return radiance + specular
         visibility = self.irradiance_visibility
         visibility = 1 if visibility is None else dr.gather(mi.Color3f, visibility, index)
-        return lighting.diffuse(surface, irradiance_visibility=visibility) + specular
+        return lighting.for_secondary_bounce().radiance(self.surfels.take(index), uv, -direction, visibility)

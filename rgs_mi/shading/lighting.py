@@ -93,6 +93,41 @@ class Lighting:
         """Return C_d of a lit `Surface`, as `specular` does C_s; ``irradiance_visibility`` is a of (9) in `indirect.py`."""
         return self.estimator.diffuse(surface, self._incident_radiance(surface), irradiance_visibility)
 
+    def radiance(
+        self,
+        surfels: Surfels,
+        uv: "mi.Point2f",
+        view: "mi.Vector3f",
+        irradiance_visibility: "mi.Color3f | float" = 1,
+    ) -> "mi.Color3f":
+        """Return the linear radiance that each of the ``surfels`` sends along its unit ``view``, in world space, from ``uv``
+        on it, in standard deviations from its center: C_d + f_φ(C_s), or in places out of the `box` its own alone."""
+        own = surfels.radiance(-view)
+        if self.box is None:
+            return self._reflected(surfels, uv, view, own, irradiance_visibility)
+        inside = dr.compress(self.box.contains(surfels.column(mi.Point3f, "centers")))
+        if dr.width(inside) > 0:
+            at = lambda v: v if isinstance(v, int) else dr.gather(type(v), v, inside)
+            part = self._reflected(surfels.take(inside), *map(at, (uv, view, own, irradiance_visibility)))
+            dr.scatter(own, part, inside)
+        return own
+
+    def _reflected(self, surfels, uv, view, own, irradiance_visibility):
+        """`radiance` of surfels in the box, whose diffuse radiance is their ``own`` where they are not lit."""
+        normal = surfels.normals(uv)
+        if surfels.two_sided:
+            normal = dr.mulsign(normal, dr.dot(view, normal))
+        surface = Surface(
+            normal,
+            view,
+            surfels.column(mi.Float, "roughness"),
+            surfels.column(mi.Float, "metallic"),
+            surfels.column(mi.Color3f, "base_color"),
+            surfels.points(uv) if self.near else None,
+        )
+        diffuse = self.diffuse(surface, irradiance_visibility) if self.lit else own
+        return diffuse + self.specular(surface)
+
     def _incident_radiance(self, surface) -> IncidentRadiance | None:
         """The callback for a surface; None where it reflects the environment alone."""
         indirect = self.indirect

@@ -6,6 +6,7 @@ under names that viewers ignore: ``base_color_0..2 roughness metallic delta_norm
 """
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from ..core.errors import UserError
 from ..core.ply_format import names_of, read_vertices, write_vertices
 
-_THICKNESS = 1e-3  # of the smaller scale: what a 3DGS viewer, which draws ellipsoids, gets as the third
+THICKNESS = 1e-3  # of the smaller scale: what a 3DGS viewer, which draws ellipsoids, gets as the third
 _TINY = np.finfo(np.float32).tiny
 _OPACITY = (1e-7, 1 - 2.0**-24)  # the open interval (0, 1) in float32
 _REMEDY = "give a PLY of surfels, from 2DGS, 3DGS or rgs_mi"
@@ -47,26 +48,38 @@ def write_ply(path: str | Path, fields: dict[str, np.ndarray]) -> None:
 
     Raises: UserError where the disk is full or the folder can't be written.
     """
-    f = {name: np.asarray(value, np.float64) for name, value in fields.items()}
+    columns = core_columns(fields) | {names: fields[field] for field, (names, _) in _MATERIAL.items()}
+    write_columns(path, columns)
+
+
+def core_columns(fields: dict[str, np.ndarray]) -> dict[tuple[str, ...], np.ndarray]:
+    """Return the columns of 3DGS, names -> [N, len(names)], of what `write_ply` takes, without the material."""
+    f = {name: np.asarray(fields[name], np.float64) for name in ("centers", "rotations", "scales", "opacities", "sh")}
     sh = f["sh"].reshape(len(f["sh"]), -1, 3)  # [N, K, 3]
     rest = sh[:, 1:].transpose(0, 2, 1).reshape(len(sh), -1)  # [N, 3*(K-1)] channel-major
     x, y, z, w = f["rotations"].T
     normals = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], -1)
     opacities = np.clip(f["opacities"], *_OPACITY)
     scales = np.maximum(f["scales"], _TINY)
-    columns = {
+    return {
         ("x", "y", "z"): f["centers"],
         ("nx", "ny", "nz"): normals,
         _CORE["f_dc"]: sh[:, 0],
         tuple(f"f_rest_{i}" for i in range(rest.shape[1])): rest,
         ("opacity",): np.log(opacities) - np.log1p(-opacities),
-        ("scale_0", "scale_1", "scale_2"): np.log(np.column_stack([scales, _THICKNESS * scales.min(1)])),
+        ("scale_0", "scale_1", "scale_2"): np.log(np.column_stack([scales, THICKNESS * scales.min(1)])),
         ("rot_0", "rot_1", "rot_2", "rot_3"): np.stack([w, x, y, z], -1),
-        **{names: f[field] for field, (names, _) in _MATERIAL.items()},
     }
+
+
+def write_columns(path: str | Path, columns: dict[tuple[str, ...], np.ndarray], comments: Sequence[str] = ()) -> None:
+    """Write ``columns`` as `core_columns` returns them as a PLY, with ``comments`` in its header, whole or not at all.
+
+    Raises: UserError where the disk is full or the folder can't be written.
+    """
     table = np.concatenate(list(columns.values()), 1, dtype=np.float32)
     vertices = table.view([(name, "f4") for names in columns for name in names])[:, 0]
-    write_vertices(path, vertices)
+    write_vertices(path, vertices, comments)
 
 
 def read_ply(path: str | Path) -> dict[str, np.ndarray]:

@@ -1,0 +1,197 @@
+"""``rgs-mi export``: what it writes of a run, and what it says of what is none."""
+
+import builtins
+import json
+import shutil
+import struct
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import rgs_mi
+from rgs_mi.commands.export import FORMATS, export
+from rgs_mi.core.errors import UserError
+from rgs_mi.export.bake import bake
+from rgs_mi.surfels.ply import read_ply, write_ply
+
+from judges import package, splat_transform, validated_gltf
+from readers import glb_splats, harmonics
+from runs import start_script
+from scenes import sphere_surfels
+
+SCENE = """<scene version="3.0.0">
+    <integrator type="rgs_deferred"> <boolean name="hide_emitters" value="true"/> </integrator>
+    <shape type="surfels"> <string name="filename" value="object.ply"/> </shape>
+    <emitter type="envmap"> <string name="filename" value="environment.exr"/>
+        <transform name="to_world"> <rotate x="1" angle="90"/> </transform> </emitter>
+    <sensor type="perspective"> <float name="fov" value="30"/>
+        <transform name="to_world"> <lookat origin="4, 0, 1" target="0, 0, 0" up="0, 0, 1"/> </transform>
+        <film type="hdrfilm"> <integer name="width" value="32"/> <integer name="height" value="32"/> </film> </sensor>
+</scene>"""
+
+
+def make_run(folder):
+    """The folder of a finished run of few surfels."""
+    folder.mkdir()
+    write_ply(folder / "object.ply", sphere_surfels(300, seed=1).numpy())
+    light = np.random.default_rng(0).uniform(0.2, 0.9, (16, 32, 3))
+    mi.Bitmap(np.float32(light)).write(str(folder / "environment.exr"))
+    (folder / "scene.xml").write_text(SCENE)
+    (folder / "metrics.json").write_text(json.dumps({"finished": True}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    rgs_mi.set_variant("llvm_ad_rgb")
+    return make_run(tmp_path_factory.mktemp("runs") / "ball")
+
+
+@pytest.mark.parametrize("to, names", [("splat", ["splats.ply"]), ("gltf-splat", ["splats.glb"])])
+def test_writes_beside_the_run(run, to, names):
+    paths = export(run, to, quiet=True)
+    assert paths == [run / "export" / to / name for name in names] and all(path.stat().st_size > 1e4 for path in paths)
+    assert sorted(path.name for path in (run / "export" / to).iterdir()) == names
+
+
+def test_usd_has_the_environment_beside_it(run, tmp_path):
+    pytest.importorskip("pxr", reason="needs OpenUSD: pip install usd-core")
+    paths = export(run, "usd", out=tmp_path / "a", kernel="surflet", quiet=True)
+    assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["environment.exr", "splats.usdc"]
+    own, written = (np.array(mi.Bitmap(str(path))) for path in (run / "environment.exr", paths[1]))
+    assert np.allclose(own, written, atol=1e-3)
+
+
+def test_script(run, tmp_path):
+    process = start_script("export.py", run, "--to", "splat", "--out", tmp_path / "b")
+    out, err = process.communicate()
+    assert process.returncode == 0 and out.strip() == str(tmp_path / "b" / "splats.ply") and "baking 100%" in err
+
+
+def test_unknown_format(run):
+    for name, nearest in (("gltf", "gltf-splat"), ("splats", "splat"), ("usdz", "usd")):
+        with pytest.raises(UserError, match=f"--to {name}: unknown format, nearest to '{nearest}'") as error:
+            export(run, name)
+        assert all(known in str(error.value) for known in FORMATS) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [({"to": "splat", "kernel": "surflet"}, "only the format 'usd'"), ({"to": "usd", "kernel": "flat"}, "unknown kernel")],
+)
+def test_kernels(run, options, words):
+    with pytest.raises(UserError, match=words):
+        export(run, **options)
+
+
+def _unfinished(folder):
+    (folder / "metrics.json").write_text(json.dumps({"finished": False}))
+    (folder / "checkpoints").mkdir()
+
+
+def _no_light(folder):
+    (folder / "environment.exr").unlink()
+
+
+def _mirrored(folder):
+    (folder / "scene.xml").write_text(SCENE.replace('<rotate x="1" angle="90"/>', '<scale x="-1"/>'))
+
+
+@pytest.mark.parametrize(
+    "spoil, words",
+    [
+        (_unfinished, "ball: holds an unfinished run: go on with 'rgs-mi optimize … --resume'"),
+        (shutil.rmtree, "no run at .*ball: give the folder"),
+        (lambda folder: (folder / "scene.xml").unlink(), "ball: holds no run"),
+        (lambda folder: (folder / "object.ply").unlink(), "object.ply: can't be read"),
+        (lambda folder: (folder / "object.ply").write_text("ply"), "object.ply: not a PLY of surfels"),
+        (_no_light, "cannot load .*scene.xml"),
+        (_mirrored, "scene.xml: 'to_world' of its envmap is no rotation"),
+    ],
+)
+def test_mistakes(tmp_path, spoil, words):
+    folder = make_run(tmp_path / "ball")
+    spoil(folder)
+    with pytest.raises(UserError, match=words) as error:
+        export(folder, "gltf-splat", quiet=True)
+    assert "\n" not in str(error.value) and not list(tmp_path.rglob("*.glb"))
+
+
+def test_no_surfels(tmp_path):
+    scene = {"type": "scene", "a": {"type": "surfels"}, "b": {"type": "rgs_deferred"}, "c": {"type": "constant"}}
+    with pytest.raises(UserError, match="scene.xml: .*no"):
+        bake(mi.load_dict(scene), "scene.xml")
+
+
+def test_missing_package(run, monkeypatch):
+    original = builtins.__import__
+
+    def without(name, *arguments, **options):
+        if name.partition(".")[0] == "pxr":
+            raise ImportError(name)
+        return original(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(UserError, match=r"OpenUSD is not installed: pip install 'rgs-mi\[usd\]'"):
+        export(run, "usd", quiet=True)
+
+
+# ---- Judged by others ----
+
+
+def test_khronos_validator(run, tmp_path):
+    """Its latest release, of 2024, does not know the extension: it says so, and takes no name with a colon for an attribute.
+    It has nothing else to say."""
+    package("gltf-validator")
+    (path,) = export(run, "gltf-splat", out=tmp_path, quiet=True)
+
+    def others(path):
+        messages = validated_gltf(path)
+        known = lambda m: "KHR_gaussian_splatting" in (m["pointer"] + m["message"])
+        named = [m for m in messages if m["code"] == "MESH_PRIMITIVE_INVALID_ATTRIBUTE" and known(m)]
+        assert len(named) in (0, 19)
+        return [m for m in messages if m not in named and not (m["code"] == "UNSUPPORTED_EXTENSION" and known(m))]
+
+    assert others(path) == []
+    for spoil in (_wrong_bound, _too_many):
+        assert [m for m in others(_spoiled(path, spoil)) if m["severity"] == 0]
+
+
+def _wrong_bound(document):
+    document["accessors"][0]["max"][0] += 1
+
+
+def _too_many(document):
+    document["accessors"][4]["count"] += 1
+
+
+def _spoiled(path, change):
+    """A copy of a GLB whose JSON ``change`` has changed."""
+    data = path.read_bytes()
+    end = 20 + int.from_bytes(data[12:16], "little")
+    change(document := json.loads(data[20:end]))
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    sizes = struct.pack("<II", 20 + len(text) + len(data) - end, len(text))
+    path = path.with_stem("spoiled")
+    path.write_bytes(data[:8] + sizes + b"JSON" + text + data[end:])
+    return path
+
+
+def test_splat_transform_reads_the_ply(run, tmp_path):
+    """And its own GLB of it, in a world that it turns by half about z, shows the same: it turns harmonics by code that is not
+    ours."""
+    package("@playcanvas/splat-transform")
+    (path,) = export(run, "splat", out=tmp_path, quiet=True)
+    splat_transform("-q", path, tmp_path / "theirs.glb")
+    (centers, _, scales, opacities, sh), _, _ = glb_splats(tmp_path / "theirs.glb")
+    turn, fields = np.diag([-1.0, -1.0, 1.0]), read_ply(path)
+    order = [abs(centers - center).sum(1).argmin() for center in fields["centers"] @ turn]
+    assert sorted(order) == list(range(300)) and abs(centers[order] - fields["centers"] @ turn).max() < 1e-5
+    assert abs(scales[order][:, :2] - fields["scales"]).max() < 1e-4
+    assert abs(opacities[order] - fields["opacities"][:, 0]).max() < 1e-3
+    for d in np.array([[0.6, 0, 0.8], [-0.36, 0.48, 0.8], [0, -1, 0]]):
+        ours = np.einsum("k,nkc->nc", harmonics(d), fields["sh"].reshape(300, 16, 3))
+        theirs = np.einsum("k,nkc->nc", harmonics(turn @ d), sh[order])
+        assert abs(ours - theirs).max() < 1e-3
