@@ -29,8 +29,8 @@ what a principled BSDF with the G-buffer's material reflects of the environment 
 
  * - box
    - |string|
-   - Six numbers, lower and upper corner: only what lies in this box reflects light. What lies beyond, the surroundings in a
-     capture without masks, has its diffuse radiance alone, also in reflections, with ``one_bounce`` (Default: none, everything)
+   - Six numbers, lower and upper corner: only what lies in this box reflects light, and is met by reflected rays. What lies
+     beyond, the surroundings in a capture without masks, has its diffuse radiance alone (Default: none, everything)
 
  * - turntable
    - |string|

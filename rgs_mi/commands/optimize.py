@@ -140,7 +140,7 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
             begin.roughness,
             settings.shader,
             two_sided=None if box is None else True,
-            room=settings.room and (middle, settings.room * extent),
+            room=(middle, settings.room * extent) if settings.room else None,
         )
         return Fit(shown, model, settings, extent, _shading(scene, settings, dataset), _priors(shown, settings))
 

@@ -56,8 +56,8 @@ def bake(scene: "mi.Scene", path: str | Path, quiet: bool = False) -> Splats:
             done += len(colors)
             progress.update(done / len(surfels))
     fields = surfels.numpy()
-    geometry = (fields[name] for name in ("centers", "rotations", "scales"))
-    return Splats(*geometry, fields["opacities"][:, 0], np.concatenate(sh))
+    centers, rotations, scales = (fields[name] for name in ("centers", "rotations", "scales"))
+    return Splats(centers, rotations, scales, fields["opacities"][:, 0], np.concatenate(sh))
 
 
 def fit(colors: np.ndarray, weights: np.ndarray) -> np.ndarray:

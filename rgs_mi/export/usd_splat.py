@@ -1,4 +1,6 @@
 """Splats as OpenUSD's particle fields (26.03 and later), under a dome light."""
+# pyright: reportAttributeAccessIssue=false
+# OpenUSD's modules fill themselves when they are imported.
 
 import tempfile
 from pathlib import Path

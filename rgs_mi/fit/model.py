@@ -81,7 +81,7 @@ class Model:
         roughness: float = 0.3,
         shader: str = "identity",
         two_sided: bool | None = None,
-        room: tuple[Sequence[float], float] | None = None,
+        room: tuple[np.ndarray | Sequence[float], float] | None = None,
     ) -> "Model":
         """Make the model that a fit starts with.
 

@@ -183,7 +183,7 @@ class Fit:
         if due or self.proxies is None:
             self.proxies = self.irradiance_visibility = None
             if shading.indirect != "none":
-                self.proxies = shading.proxies(surfels)
+                self.proxies = Proxies(surfels, box=shading.box)
                 if shading.diffuse == "lit" and (lighting := self.lighting(surfels, training=True)) and lighting.indirect:
                     self.irradiance_visibility = lighting.indirect.irradiance_visibility
 

@@ -76,18 +76,15 @@ class Environment:
         local = self.to_local(d)
         if self.room is None or point is None:
             return local, mi.Float(1), mi.Float(1)
-        return self.room.seen(local, self.to_local(self._from_center(point)))
+        return self.room.seen(local, self.to_local(self.room.from_center(point)))
 
     def seen_from(self, d: "mi.Vector3f", point: "mi.Point3f | None") -> "mi.Vector3f":
         """Return along which world-space directions ``point`` sees what the emitter, which knows neither turn nor room, has
         along ``d``."""
         if self.room is not None and point is not None:
             local = _matrix(np.linalg.inv(self.rotation)) @ d
-            d = self.to_world(self.room.seen_from(local, self.to_local(self._from_center(point))))
+            d = self.to_world(self.room.seen_from(local, self.to_local(self.room.from_center(point))))
         return d if self.turn is None else self.turn.T @ d
-
-    def _from_center(self, point):
-        return mi.Vector3f(point - mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in self.room.center)))
 
     def filtered(self) -> "FilteredEnvironment":
         """Return the environment convolved with the BSDF's lobe at every level of roughness (docs/method.md §3)."""
@@ -192,12 +189,11 @@ class FilteredEnvironment:
         longitude, colatitude = self._coordinates(local)
         if roughness is None:
             return self._level(longitude, colatitude, mi.UInt32(0))
-        if point is not None and self.environment.room is not None:
-            roughness = dr.minimum(roughness * dr.rsqrt(farther), 1)
+        seen = roughness if self.environment.room is None else roughness * dr.rsqrt(farther)
         nodes = [r for r, _ in _prefilter.LEVELS]
         position = mi.Float(0)
         for low, high in zip(nodes[:-1], nodes[1:]):
-            position += dr.clip((roughness - low) / (high - low), 0, 1)
+            position += dr.clip((seen - low) / (high - low), 0, 1)
         level = dr.minimum(mi.UInt32(dr.detach(position)), len(nodes) - 2)
         return dr.lerp(
             self._level(longitude, colatitude, level),

@@ -38,11 +38,6 @@ class Shading:
     indirect: Literal["none", "visibility", "one_bounce"] = "none"
     turntable: Turntable | None = None
 
-    def proxies(self, surfels: Surfels) -> Proxies:
-        """Return what rays meet that ``surfels`` reflect: each other, or what lies around the box, too, where that sends
-        light."""
-        return Proxies(surfels, box=self.box, beyond=self.indirect == "one_bounce")
-
 
 @dataclass
 class Lighting:
@@ -163,8 +158,8 @@ class Lighting:
         return 1 if self._with_visibility is None else maps.diffuse * mean
 
     def for_secondary_bounce(self) -> "Lighting":
-        """Return the lighting of what a reflected ray meets: it reflects the environment alone."""
-        return replace(self, estimator=self.estimator.for_secondary_bounce(), indirect=None)
+        """Return the lighting of what a reflected ray meets, which lies in the box: it reflects the environment alone."""
+        return replace(self, estimator=self.estimator.for_secondary_bounce(), indirect=None, box=None)
 
     def learned(self) -> list:
         """Return the arrays that a fit changes: those of the environment as the estimator has it, and the weights of the
@@ -213,7 +208,7 @@ def lighting_of(
         estimator = MonteCarlo(environment, emitter, shading.eta, shading.samples, random, paired)
     indirect = None
     if shading.indirect != "none":
-        proxies = shading.proxies(surfels) if proxies is None else proxies
+        proxies = Proxies(surfels, box=shading.box) if proxies is None else proxies
         indirect = Indirect(shading.indirect, proxies, surfels, shading.box, irradiance_visibility)
     lighting = Lighting(estimator, shader, indirect, lit, shading.box, shading.turntable)
     # Where the light is sampled, its rays say by themselves what is hidden

@@ -55,6 +55,10 @@ class Room:
         """The numbers that `of` takes."""
         return " ".join(f"{v:.9g}" for v in (*self.center, *self.distances))
 
+    def from_center(self, point: "mi.Point3f") -> "mi.Vector3f":
+        """Return the vectors from the center to world-space ``point``, in world space."""
+        return mi.Vector3f(point - mi.Point3f(*(dr.opaque(mi.Float, v) for v in self.center)))
+
     def seen(self, direction: "mi.Vector3f", q: "mi.Vector3f") -> "tuple[mi.Vector3f, mi.Float, mi.Float]":
         """Return ω' of (14), s, and the density dω'/dω = 1 / (s³ (1 − κ|q|)) of directions at the center over those at q; all in
         the environment's frame, ``q`` relative to the center."""

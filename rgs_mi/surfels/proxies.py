@@ -34,29 +34,25 @@ def quads(corners: "list[mi.Point3f]") -> "tuple[mi.Float, mi.UInt32]":
 
 class Proxies:
     """Where the surfels were when this was built, for rays to meet: each as the quad in which its alpha exceeds the
-    threshold ``solid``; where there is a ``box``, only those in it, unless rays go ``beyond``, too. Not differentiated.
+    threshold ``solid``; only those in the ``box``, where there is one. Not differentiated.
 
       scene      what rays meet: surfel i is the triangles 2 i and 2 i + 1
       extent     half the width of each quad, in standard deviations
       normal     geometric normals, world space
-      clearance  how far above the surface rays start, which lies in the box, world units, of width 1
+      clearance  how far above the surface rays start, world units, of width 1
     """
 
-    def __init__(
-        self, surfels: Surfels, solid: float = _SOLID, box: BoundingBox | None = None, beyond: bool = False
-    ) -> None:
+    def __init__(self, surfels: Surfels, solid: float = _SOLID, box: BoundingBox | None = None) -> None:
         with dr.suspend_grad():
             opacity = surfels.column(mi.Float, "opacities")
-            inside = mi.Bool(True) if box is None else box.contains(surfels.column(mi.Point3f, "centers"))
-            if not beyond:
-                opacity = dr.select(inside, opacity, 0)
+            if box is not None:
+                opacity = dr.select(box.contains(surfels.column(mi.Point3f, "centers")), opacity, 0)
             self.extent = dr.sqrt(2 * dr.log(dr.maximum(opacity / solid, 1)))
             positions, faces = quads(corners(surfels, self.extent))
             self.normal = surfels.frames()[2]
             scale = surfels.column(mi.Vector2f, "scales")
-            part = dr.select(inside, mi.Float(1), 0) + dr.zeros(mi.Float, len(surfels))
-            narrow = part * dr.minimum(scale.x, scale.y)
-            self.clearance = _CLEARANCE * dr.sum(narrow) / dr.maximum(dr.sum(part), 1)
+            count = dr.opaque(mi.Float, len(surfels))  # dr.mean would compile it into a kernel
+            self.clearance = _CLEARANCE * dr.sum(dr.minimum(scale.x, scale.y)) / count
             dr.eval(positions, faces, self.extent, self.normal, self.clearance)
             mesh = mi.Mesh("proxies", 4 * len(surfels), 2 * len(surfels))
             params = mi.traverse(mesh)
