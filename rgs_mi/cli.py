@@ -6,7 +6,7 @@ import sys
 
 from .core.errors import run_main
 from .core.runtime import CACHE_VARIABLE, cache_folder
-from .verbs import captures, fits, renderings, suites
+from .verbs import captures, fits, renderings, suites, windows
 from .verbs.arguments import Parser
 
 VERBS = {
@@ -16,6 +16,7 @@ VERBS = {
     "recovery": fits.recovery,
     "render": renderings.render,
     "render-dataset": renderings.render_dataset,
+    "view": windows.view,
     "ablate": suites.ablate,
     "benchmark": suites.benchmark,
     "crossvalidate": suites.crossvalidate,

@@ -1,0 +1,59 @@
+"""The environments that a window offers: the scene's own, those of the suite, and files that were named at the start."""
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+
+from ..export.relight import load_envmap
+from ..shading import prefilter
+from ..shading.environment import Environment, FilteredEnvironment
+from ..targets.environments import ENVIRONMENTS
+from .look import OWN
+
+
+class Lights:
+    """Environments by name, in the orientation of the scene's ``own``, each filtered the first time that someone asks for it.
+
+    ``names``: what can be chosen, and nothing else can be. A filter's operator takes seconds, and is computed in another thread
+    meanwhile; all else is done by the caller.
+    Raises: UserError for a file that can't be read.
+    """
+
+    def __init__(self, own: Environment, files: Iterable[str | Path] = ()) -> None:
+        self._own = own
+        self._files = {str(path): Environment.from_emitter(load_envmap(path)) for path in files}
+        self.names = (OWN, *self._files, *sorted(ENVIRONMENTS))
+        self._filtered: dict[str, FilteredEnvironment] = {}
+        self._filters = ThreadPoolExecutor(1, "filter")
+        self._first = self._filters.submit(prefilter.prefilter, *own.size, mi.variant())
+
+    def __getitem__(self, name: str) -> FilteredEnvironment:
+        """The environment ``name``; waits where it was not `prepared`."""
+        if name not in self._filtered:
+            if name == OWN:
+                self._first.result()
+            self._filtered[name] = self._environment(name).filtered()
+        return self._filtered[name]
+
+    def prepare(self, name: str, ready: Callable[[], None]) -> None:
+        """Call ``ready()``, from another thread, once ``name`` is there without waiting."""
+        if name in self._filtered:
+            ready()
+            return
+        size = self._environment(name).size
+        future = self._filters.submit(prefilter.prefilter, *size, mi.variant())
+        future.add_done_callback(lambda _: ready())
+
+    def close(self) -> None:
+        """End the thread."""
+        self._filters.shutdown(wait=False, cancel_futures=True)
+
+    def _environment(self, name):
+        if name == OWN:
+            return self._own
+        if name not in self._files:
+            self._files[name] = Environment.from_emitter(load_envmap(name))
+        return replace(self._files[name], rotation=self._own.rotation)
