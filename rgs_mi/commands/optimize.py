@@ -46,6 +46,7 @@ def optimize(
     resume: bool = False,
     quiet: bool = False,
     tensorboard: bool = False,
+    window: tuple[str, int] | None = None,
 ) -> Path:
     """Fit the scene at ``path`` and write the run's folder, which is returned.
 
@@ -55,6 +56,7 @@ def optimize(
       out:     the run's folder (default: runs/NAME)
       resume:  go on from the newest checkpoint in ``out``
       tensorboard: write event files into the folder's ``tensorboard``
+      window:  host and port of a page that shows the fit while it goes on (`viewer.live`)
 
     Raises: UserError for bad input, a package that is missing, a folder that can't be written, and a fit that diverges.
     """
@@ -69,15 +71,27 @@ def optimize(
     fit = _resume(saved, scene, dataset, settings) if saved else start(scene, dataset, settings, quiet)
     if not quiet:
         print(told(fit.settings, dataset))
+    watch = _watched(fit, folder, window)
     try:
-        stopped = _loop(fit, folder, quiet, events)
+        stopped = _loop(fit, folder, quiet, events, watch)
     finally:
-        if events:
-            events.close()
+        for opened in filter(None, (events, watch)):
+            opened.close()
     results.write(fit, scene, folder, quiet)
     if stopped:
         print(f"stopped at {100 * fit.progress:.0f}%; go on with the same command and --resume")
     return folder
+
+
+def _watched(fit, folder, window):
+    """The window on the fit, where someone asked for one. Raises: UserError where it can't be opened."""
+    if window is None:
+        return None
+    from ..viewer.live import Watch
+
+    watch = Watch(fit, str(folder), *window)
+    print(watch.address, flush=True)
+    return watch
 
 
 def budget(minutes: float | None) -> list[str]:
@@ -219,8 +233,8 @@ def _flat(tree, prefix="") -> dict:
 # ---- Loop ----
 
 
-def _loop(fit, folder, quiet, events=None) -> bool:
-    """Step until the budget is spent or someone interrupts; returns whether someone did. Begins and ends with a
+def _loop(fit, folder, quiet, events=None, watch=None) -> bool:
+    """Step until the budget is spent or someone interrupts, from a keyboard or a window (``watch``); returns whether someone did. Begins and ends with a
     checkpoint: a folder that can't be written is known before the work, not after it."""
     settings, psnr = fit.settings, None
     checkpoint.save(folder, *_state(fit, folder))
@@ -246,6 +260,9 @@ def _loop(fit, folder, quiet, events=None) -> bool:
                 except UserError as error:
                     warnings.warn(f"no checkpoint this time, the fit goes on: {error}", stacklevel=2)
                 saved = time.monotonic()
+            if watch:
+                watch.between()
+                interrupt.requested |= watch.stopped
         checkpoint.save(folder, *_state(fit, folder))
     return interrupt.requested
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from ..core.errors import parse_variables
 from ..core.runtime import set_variant
 from ..core.scene_files import find_scene
-from .arguments import Parser, Run, add_common, add_integer, add_variables, known
+from .arguments import Parser, Run, add_address, add_common, add_variables, known
 
 
 def view(parser: Parser) -> Run:
@@ -40,11 +40,3 @@ def view(parser: Parser) -> Run:
         )
 
     return run
-
-
-def add_address(parser: Parser) -> None:
-    """Add --host and --port, where a window's page is."""
-    parser.add_argument(
-        "--host", default="localhost", help="address to listen at; 0.0.0.0 lets other machines in (default: %(default)s)"
-    )
-    add_integer(parser, "--port", 8080, "of the page, 0 for any that is free")

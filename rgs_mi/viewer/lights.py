@@ -47,6 +47,10 @@ class Lights:
         future = self._filters.submit(prefilter.prefilter, *size, mi.variant())
         future.add_done_callback(lambda _: ready())
 
+    def set_own(self, own: FilteredEnvironment) -> None:
+        """Put another light in place of the scene's own: that which a fit has found by now."""
+        self._own, self._filtered[OWN] = own.environment, own
+
     def close(self) -> None:
         """End the thread."""
         self._filters.shutdown(wait=False, cancel_futures=True)

@@ -9,7 +9,6 @@ import numpy as np
 
 from ..core.camera import Camera
 from ..export.render import pose
-from .maps import MAPS
 
 OWN = "as in the scene"  # the light that is not replaced
 BACKGROUNDS = ("white", "black", "light")  # the last is the environment

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..core.camera import Camera
-from ..core.color import exposed, srgb_encode
 from ..core.color import display as over_background
+from ..core.color import exposed, srgb_encode
 from ..datasets.types import View
 from ..evaluation.metrics import normal_colors
 from ..evaluation.pictures import ERROR_RANGE, ramp

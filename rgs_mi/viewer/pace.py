@@ -3,17 +3,25 @@
 import time
 from collections.abc import Callable
 
-GRIDS = (128, 200, 288, 400)  # points along both sides; the browser stretches them to its window, whose pixels are not square then
+GRIDS = (
+    128,
+    200,
+    288,
+    400,
+)  # points along both sides; the browser stretches them to its window, whose pixels are not square then
 RATE = 15  # frames a second
-_MARGIN, _HYSTERESIS = 0.8, 0.85  # of a frame's time: what encoding and sending take, and what a larger grid has to keep clear of
+_MARGIN, _HYSTERESIS = (
+    0.8,
+    0.85,
+)  # of a frame's time: what encoding and sending take, and what a larger grid has to keep clear of
 _SMOOTHING = 0.7
 
 
 class Pace:
     """Which of `GRIDS` to draw next.
 
-    ``measure(grid)`` draws a picture of that size, twice in `warm`: the first compiles what the second is measured by. Later
-    frames say by how much the machine is slower, or faster, than it was then.
+    ``seconds``: what a frame of each grid took when it was made `warm`. Later frames say by how much the machine is slower, or
+    faster, than it was then.
     """
 
     def __init__(self) -> None:
@@ -25,9 +33,9 @@ class Pace:
         """The smallest grid that was not drawn yet; None once all are warm."""
         return next((grid for grid in GRIDS if grid not in self.seconds), None)
 
-    def warm(self, grid: int, draw: Callable[[int], object]) -> None:
-        """Compile what ``draw(grid)`` needs, and measure it."""
-        draw(grid)
+    def warm(self, grid: int, compile: Callable[[int], object], draw: Callable[[int], object]) -> None:
+        """Have ``compile(grid)`` compile what the grid needs, and measure ``draw(grid)``."""
+        compile(grid)
         start = time.perf_counter()
         draw(grid)
         self.seconds[grid] = time.perf_counter() - start

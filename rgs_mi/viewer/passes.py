@@ -12,7 +12,7 @@ from ..shading import deferred
 from ..splat.tiles import Cutoffs
 from .look import Look, shifted
 from .maps import GBUFFER, MAPS, SHADED
-from .subject import Lit, Subject
+from .subject import Subject
 
 SIDE = 4
 SAMPLES = SIDE * SIDE  # of a picture at rest: a grid in each pixel
@@ -31,7 +31,9 @@ def measure(subject: Subject, look: Look, camera: Camera, settled: bool, side: i
     lit, name, (width, height) = subject.lit(look, settled), MAPS[look.map], camera.size
     turntable = subject.turntable(look)
     with dr.suspend_grad():
-        image = deferred.render(lit.surfels, camera, lit.lighting if name in SHADED else None, cutoffs=Cutoffs().of_sample(side))
+        image = deferred.render(
+            lit.surfels, camera, lit.lighting if name in SHADED else None, cutoffs=Cutoffs().of_sample(side)
+        )
         rows = lambda array: array.numpy().reshape(height, width, -1)
         measured = {}
         if name in SHADED:
@@ -66,7 +68,9 @@ class Refined:
         if subject.still is not None and look.map == "picture":
             measured = traced(subject, look.camera, self.samples)
         else:
-            measured = measure(subject, look, shifted(look.camera, *offset(self.samples, self.side)), settled=True, side=self.side)
+            measured = measure(
+                subject, look, shifted(look.camera, *offset(self.samples, self.side)), settled=True, side=self.side
+            )
         self.samples += 1
         for name, values in measured.items():
             before = self.means.get(name)

@@ -15,8 +15,8 @@ from .frusta import Frusta
 from .look import Look, window_camera
 from .pace import Pace
 from .panel import Panel
-from .passes import measure
 from .subject import Subject
+from .warm import draw, warm
 from .window import Window
 
 if TYPE_CHECKING:
@@ -30,13 +30,22 @@ class Server:
     """Shows a ``subject`` to browsers at ``address``. All that Dr.Jit computes is computed in `turn`, by whoever calls it: one
     thread alone.
 
-    ``name``: of the scene or run, in commands and files. ``port`` 0 is any that is free.
+    ``name``: of the scene or run, in commands and files. ``port`` 0 is any that is free. ``entered(client, window)`` is called
+    for every window, and may add controls of its own.
     Raises: UserError where viser is not installed, or the port is taken.
     """
 
-    def __init__(self, subject: Subject, name: str, host: str = HOST, port: int = PORT) -> None:
+    def __init__(
+        self,
+        subject: Subject,
+        name: str,
+        host: str = HOST,
+        port: int = PORT,
+        entered: "Callable[[viser.ClientHandle, Window], None]" = lambda client, window: None,
+    ) -> None:
         self.subject, self.name, self.pace = subject, name, Pace()
         self.windows: dict[int, Window] = {}
+        self._entered = entered
         self.wake = threading.Event()
         self._jobs: deque[Callable[[], None]] = deque()  # that windows have asked for
         self._panels: dict[int, Panel] = {}
@@ -52,7 +61,10 @@ class Server:
 
     def close(self) -> None:
         """Close the page, and forget all windows."""
-        self._page.stop()
+        with contextlib.redirect_stdout(io.StringIO()):  # its own farewell
+            self._page.stop()
+        if self.subject.lights is not None:
+            self.subject.lights.close()
         self.windows.clear()
 
     # ---- Windows come and go ----
@@ -68,6 +80,7 @@ class Server:
         if camera is None:
             return
         window = Window(Look(camera), self.wake.set)
+        self._entered(client, window)
         panel = Panel(client, window, self)
         frusta = Frusta(client, window, self.subject)
         panel.frusta = frusta
@@ -132,16 +145,8 @@ class Server:
             panel.show(picture)
 
     def _warm(self):
-        """Compile what the smallest grid needs that is not warm yet: for what is shaded with the light behind it, and from two
-        places, for what is the same in both is compiled in."""
-        first = self.subject.cameras[0]
-        looks = [Look(camera, background="light") for camera in (first, self.subject.cameras[-1].resized(*first.size))]
-
-        def draw(grid):
-            for look in looks:
-                measure(self.subject, look, look.camera.resized(grid, grid), settled=False)
-
-        self.pace.warm(self.pace.cold, draw)
+        """Compile what the smallest grid needs that is not warm yet."""
+        self.pace.warm(self.pace.cold, lambda grid: warm(self.subject, grid), lambda grid: draw(self.subject, grid))
 
 
 def _camera(client):

@@ -54,13 +54,18 @@ class Subject:
     cameras: list[Camera]
     views: list[View] = field(default_factory=list)
     still: Any = None
+    proxies: Proxies | None = None  # what reflected rays meet; made where it is needed
+    irradiance_visibility: "mi.Color3f | None" = None  # under a light before
+    changing: bool = False  # whether it is a fit in progress, which is never `settled`
 
     def __post_init__(self) -> None:
+        self._arrays: dict[str, np.ndarray] = {}
         self._lit: dict[tuple, Lit] = {}
-        self._proxies: Proxies | None = None
-        self._visibility: mi.Color3f | None = None  # of a light before
-        self._arrays = {name: getattr(self.surfels, name).numpy() for name in ("centers", *MATERIAL)}
-        self._bounds = np.percentile(self._arrays["centers"], (1, 99), axis=0)
+        self._bounds = np.percentile(dr.detach(self.surfels.centers).numpy(), (1, 99), axis=0)
+
+    def forget(self) -> None:
+        """Forget what was derived from surfels and lights that were replaced."""
+        self._arrays, self._lit = {}, {}
 
     @classmethod
     def of(cls, scene: "mi.Scene", views: Iterable[View] = (), envmaps: Iterable[str | Path] = ()) -> "Subject":
@@ -77,7 +82,10 @@ class Subject:
             shading, shader = integrator.shading(eta), integrator.shader
         else:
             lit = getattr(integrator, "diffuse", "radiance") if emitter else "radiance"
-            shading, shader = Shading("split_sum" if emitter else "none", lit, eta=eta, box=getattr(integrator, "box", None)), None
+            shading, shader = (
+                Shading("split_sum" if emitter else "none", lit, eta=eta, box=getattr(integrator, "box", None)),
+                None,
+            )
         cameras = [view.camera for view in views] or [Camera.from_sensor(sensor) for sensor in scene.sensors()]
         return cls(
             surfels,
@@ -122,6 +130,7 @@ class Subject:
     def lit(self, look: Look, settled: bool) -> Lit:
         """Return the surfels under the light of ``look``, with its materials. Where it is not ``settled`` yet, what is sampled is
         filtered instead, and what the object hides of a light is that of one before."""
+        settled = settled and not self.changing
         key = look.light, look.rotate, look.brighten, look.changes(), settled and self._settles
         if key not in self._lit:
             while len(self._lit) >= _KEPT:
@@ -141,31 +150,37 @@ class Subject:
         return hidden or self.shading.specular == "monte_carlo"
 
     def _make(self, look, settled):
-        changes = edited(self._arrays, look.changes())
-        surfels = replace(self.surfels, **{name: as_tensor(values) for name, values in changes.items()})
+        surfels = self._edited(look)
         if self.lights is None:
             return Lit(surfels, None, None)
         environment = _turned(self.lights[look.light], look)
         shading = replace(self.shading, turntable=self.turntable(look))
         sampled, emitter = shading.specular == "monte_carlo" and settled, None
-        if shading.indirect != "none" and self._proxies is None:
-            self._proxies = Proxies(self.surfels, box=shading.box)
-        if not sampled:
-            shading = replace(shading, specular="split_sum")
-        else:
+        if shading.indirect != "none" and self.proxies is None:
+            self.proxies = Proxies(self.surfels, box=shading.box)
+        if sampled:
             emitter = environment.environment.emitter()
+        elif shading.specular != "none":
+            shading = replace(shading, specular="split_sum")
         lighting = lighting_of(
             shading,
             surfels,
             environment.environment.unfiltered() if sampled else environment,
             emitter,
             self.shader,
-            proxies=self._proxies,
-            irradiance_visibility=None if settled else self._visibility,
+            proxies=self.proxies,
+            irradiance_visibility=None if settled else self.irradiance_visibility,
         )
         if lighting is not None and lighting.indirect is not None and not sampled:
-            self._visibility = lighting.indirect.irradiance_visibility
+            self.irradiance_visibility = lighting.indirect.irradiance_visibility
         return Lit(surfels, lighting, environment)
+
+    def _edited(self, look):
+        """The surfels with the materials of ``look``, which lie in memory as what is edited does: kernels know the difference."""
+        if not self._arrays:
+            self._arrays = {name: dr.detach(getattr(self.surfels, name)).numpy() for name in ("centers", *MATERIAL)}
+        materials = self._arrays | edited(self._arrays, look.changes())
+        return replace(self.surfels, **{name: as_tensor(materials[name]) for name in MATERIAL})
 
 
 def _turned(light, look):

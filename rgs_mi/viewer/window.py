@@ -34,13 +34,14 @@ class Window:
     """What one browser sees. Its handlers, in the server's thread, only replace ``look``; what is drawn is drawn by `work`, in
     the one thread that renders.
 
-    ``generation`` counts changes of ``look``: a picture of an older one is worth nothing.
+    ``generation`` counts changes of ``look``: a picture of an older one is worth nothing. ``hurried``: pictures are those in
+    motion, also at rest.
     """
 
     def __init__(self, look: Look, wake: Callable[[], None] = lambda: None) -> None:
         self.look, self.generation, self.moved = look, 0, time.monotonic()
         self.refined = Refined()
-        self.with_depth = False
+        self.with_depth = self.hurried = False
         self._lock, self._wake = threading.Lock(), wake
         self._moving, self._refining = -1, -1  # generations that were drawn, and that are being refined
 
@@ -65,8 +66,10 @@ class Window:
 
     def due(self) -> float:
         """Return in how many seconds there is something to draw: 0 for now, infinity for never, unless something happens."""
-        if self._moving != self.generation and self.moving:
+        if self._moving != self.generation and (self.moving or self.hurried):
             return 0.0
+        if self.hurried:
+            return float("inf")
         if self._refining != self.generation or self.refined.samples < SAMPLES:
             return max(0.0, self.moved + REST - time.monotonic())
         return float("inf")
@@ -75,7 +78,7 @@ class Window:
         """Draw what is due by now, one pass; None where it was outdated before it was done."""
         with self._lock:
             look, generation = self.look, self.generation
-        if self.moving:
+        if self.moving or self.hurried:
             return self._in_motion(subject, look, generation, pace, windows)
         return self._at_rest(subject, look, generation)
 
