@@ -234,8 +234,8 @@ def _flat(tree, prefix="") -> dict:
 
 
 def _loop(fit, folder, quiet, events=None, watch=None) -> bool:
-    """Step until the budget is spent or someone interrupts, from a keyboard or a window (``watch``); returns whether someone did. Begins and ends with a
-    checkpoint: a folder that can't be written is known before the work, not after it."""
+    """Step until the budget is spent or someone interrupts, also in a window (``watch``); returns whether someone did. Begins
+    and ends with a checkpoint: a folder that can't be written is known before the work, not after it."""
     settings, psnr = fit.settings, None
     checkpoint.save(folder, *_state(fit, folder))
     (folder / results.METRICS).unlink(missing_ok=True)  # from here on the run is unfinished

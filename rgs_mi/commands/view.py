@@ -37,7 +37,8 @@ def view(
     """
     path = Path(path)
     scene = path / SCENE if path.is_dir() else path
-    subject = Subject.of(load_scene(scene, variables or {}), _photographs(path, data), envmaps)
+    subject = Subject.of(load_scene(scene, variables or {}), envmaps)  # whose light is filtered meanwhile, in a thread
+    subject.compare_with(_photographs(path, data))
     server = Server(subject, str(path), host, port)
     print(f"{server.address} (Ctrl-C closes it)", flush=True)
     try:

@@ -9,7 +9,7 @@ from .arguments import Parser, Run, add_address, add_common, add_variables, know
 
 
 def view(parser: Parser) -> Run:
-    """Look at a fit in a browser, turn it, relight it, and compare it with its photographs; needs `pip install 'rgs-mi[viewer]'`."""
+    """Look at a fit in a browser, turn it, relight it, compare it with its photographs; needs `pip install 'rgs-mi[viewer]'`."""
     parser.add_argument("scene", metavar="RUN_OR_SCENE", help=f"a run's folder, an XML file, or {known('scenes')}")
     add_variables(parser)
     parser.add_argument("--data", type=Path, metavar="DIR", help="the folder of its photographs (default: where they were)")

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 
 from ..export.relight import load_envmap
 from ..shading import prefilter
@@ -29,6 +30,11 @@ class Lights:
         self._filtered: dict[str, FilteredEnvironment] = {}
         self._filters = ThreadPoolExecutor(1, "filter")
         self._first = self._filters.submit(prefilter.prefilter, *own.size, mi.variant())
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """The rotation [3, 3] of all of them, to world space; their up axis is y."""
+        return self._own.rotation
 
     def __getitem__(self, name: str) -> FilteredEnvironment:
         """The environment ``name``; waits where it was not `prepared`."""

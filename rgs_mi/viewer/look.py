@@ -37,7 +37,7 @@ class Look:
     map         what is shown, of `MAPS`
     light       the environment's name (`Lights`); rotate, degrees about the vertical; brighten, stops
     background  behind the object, of `BACKGROUNDS`
-    material    of all surfels; ``region_material`` of those in the ball ``region`` (x, y, z, radius; None: there is none) after it
+    material    of all surfels; after it, ``region_material`` of those in the ball ``region`` (x, y, z, radius; None: none)
     exposure, tone  of what is radiance: `core.color.exposed`
     through     the name of the photograph whose place the camera has taken, or None; that far from the left, a part of the
                 width, it shows: ``wipe``

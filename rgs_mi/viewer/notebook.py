@@ -67,7 +67,9 @@ def show(
     """
     if mi.variant() is None:
         set_variant()
-    shown = Shown(Server(Subject.of(scene, views, envmaps), name, host, port))
+    subject = Subject.of(scene, envmaps)
+    subject.compare_with(views)
+    shown = Shown(Server(subject, name, host, port))
     try:
         shown.start()
     except RuntimeError:  # no loop runs

@@ -48,13 +48,6 @@ def measure(subject: Subject, look: Look, camera: Camera, settled: bool, side: i
     return measured
 
 
-def traced(subject: Subject, camera: Camera, sample: int) -> dict[str, np.ndarray]:
-    """Return ``color`` and ``alpha`` of one sample a pixel by the scene's own integrator."""
-    scene, integrator = subject.still
-    image = np.array(mi.render(scene, sensor=mi.load_dict(sensor_dict(camera)), integrator=integrator, spp=1, seed=sample))
-    return {"color": image[..., :3], "alpha": image[..., 3:4]}
-
-
 @dataclass
 class Refined:
     """The means of ``samples`` passes over a picture, of ``side`` × ``side`` that make it complete."""
@@ -62,19 +55,25 @@ class Refined:
     side: int = SIDE
     samples: int = 0
     means: dict[str, np.ndarray] = field(default_factory=dict)
+    _sensor: "mi.Sensor | None" = None
 
     def add(self, subject: Subject, look: Look) -> None:
-        """Add another sample to each pixel of the picture of ``look``."""
+        """Add another sample to each pixel of the picture of ``look``, always the same one."""
         if subject.still is not None and look.map == "picture":
-            measured = traced(subject, look.camera, self.samples)
+            measured = self._traced(subject, look.camera)
         else:
-            measured = measure(
-                subject, look, shifted(look.camera, *offset(self.samples, self.side)), settled=True, side=self.side
-            )
+            shift = offset(self.samples, self.side)
+            measured = measure(subject, look, shifted(look.camera, *shift), settled=True, side=self.side)
         self.samples += 1
         for name, values in measured.items():
             before = self.means.get(name)
             self.means[name] = values if before is None else before + (values - before) / self.samples
+
+    def _traced(self, subject, camera):
+        """One sample a pixel by the scene's own integrator."""
+        (scene, integrator), self._sensor = subject.still, self._sensor or mi.load_dict(sensor_dict(camera))
+        image = np.array(mi.render(scene, sensor=self._sensor, integrator=integrator, spp=1, seed=self.samples))
+        return {"color": image[..., :3], "alpha": image[..., 3:4]}
 
 
 def point_at(subject: Subject, look: Look, camera: Camera, x: float, y: float) -> np.ndarray | None:

@@ -68,41 +68,36 @@ class Subject:
         self._arrays, self._lit = {}, {}
 
     @classmethod
-    def of(cls, scene: "mi.Scene", views: Iterable[View] = (), envmaps: Iterable[str | Path] = ()) -> "Subject":
-        """Take what there is to see from a loaded ``scene``, with photographs ``views`` of it, and ``envmaps`` to offer.
+    def of(cls, scene: "mi.Scene", envmaps: Iterable[str | Path] = ()) -> "Subject":
+        """Take what there is to see from a loaded ``scene``, with images ``envmaps`` to offer as lights.
 
-        Raises: UserError where there are no surfels, nothing says where to look from, or a file can't be read.
+        Raises: UserError where there are no surfels, or a file can't be read.
         """
         from ..plugins.surfels import surfels_in  # of the variant that is active now
 
         surfels, eta = surfels_in(scene)
         emitter, integrator = scene.environment(), scene.integrator()
-        deferred, views = is_deferred(integrator), list(views)
-        if deferred:
+        if deferred := is_deferred(integrator):
             shading, shader = integrator.shading(eta), integrator.shader
         else:
             lit = getattr(integrator, "diffuse", "radiance") if emitter else "radiance"
-            shading, shader = (
-                Shading("split_sum" if emitter else "none", lit, eta=eta, box=getattr(integrator, "box", None)),
-                None,
-            )
-        cameras = [view.camera for view in views] or [Camera.from_sensor(sensor) for sensor in scene.sensors()]
-        return cls(
-            surfels,
-            shading,
-            shader,
-            Lights(Environment.from_emitter(emitter), envmaps) if emitter and shading.specular != "none" else None,
-            cameras or [_in_front(surfels)],
-            views,
-            None if deferred else (scene, integrator),
-        )
+            box = getattr(integrator, "box", None)
+            shading, shader = Shading("split_sum" if emitter else "none", lit, eta=eta, box=box), None
+        lights = Lights(Environment.from_emitter(emitter), envmaps) if emitter and shading.specular != "none" else None
+        cameras = [Camera.from_sensor(sensor) for sensor in scene.sensors()] or [_in_front(surfels)]
+        return cls(surfels, shading, shader, lights, cameras, still=None if deferred else (scene, integrator))
+
+    def compare_with(self, views: Iterable[View]) -> None:
+        """Take photographs of it, in whose place it is first seen."""
+        self.views = list(views)
+        self.cameras = [view.camera for view in self.views] or self.cameras
 
     # ---- Where it is ----
 
     @property
     def up(self) -> np.ndarray:
         """The up axis of its environment, unit vector [3] in world space; z where it has none."""
-        return np.array([0, 0, 1.0]) if self.lights is None else self.lights[OWN].environment.rotation[:, 1]
+        return np.array([0, 0, 1.0]) if self.lights is None else self.lights.rotation[:, 1]
 
     @property
     def center(self) -> np.ndarray:
