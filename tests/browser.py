@@ -15,18 +15,20 @@ _OPTIONS = (
     "--disable-sync",
     "--no-first-run",
 )
+_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")  # without a GPU
 
 
 @contextmanager
-def open_tab(dark: bool = False):
-    """An empty `playwright.sync_api.Page`, 1280 by 900. It has two lists more: ``errors``, what its documents complained
+def open_tab(dark: bool = False, webgl: bool = False):
+    """An empty `playwright.sync_api.Page`, 1280 by 900, which draws by ``webgl`` where asked. It has two lists more: ``errors``, what its documents complained
     about, and ``requests``, addresses that they asked for, but for data."""
     playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright: pip install playwright")
     program = next(filter(None, map(shutil.which, NAMES)), None)
     if not program:
         pytest.skip("needs Chromium: apt-get install chromium")
     with playwright.sync_playwright() as driver:
-        chromium = driver.chromium.launch(executable_path=program, args=_OPTIONS)
+        options = [option for option in _OPTIONS if option != "--disable-gpu"] + [*_WEBGL] if webgl else _OPTIONS
+        chromium = driver.chromium.launch(executable_path=program, args=options)
         page = chromium.new_page(viewport={"width": 1280, "height": 900}, color_scheme="dark" if dark else "light")
         page.errors, page.requests = [], []
         page.on("pageerror", lambda error: page.errors.append(str(error)))

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from rgs_mi.core.color import exposed, to_8bit
+from rgs_mi.core.files import write_exr
 from rgs_mi.datasets.types import View
 from rgs_mi.surfels.ply import write_ply
 from rgs_mi.viewer import passes
@@ -30,7 +31,8 @@ _SCENE = """<scene version="3.0.0">
 
 
 def write_scene(folder: Path, integrator="rgs_deferred", indirect="one_bounce", count=1500, **properties) -> Path:
-    """Write ``scene.xml``: a ball of surfels, four cameras around it; ``properties`` are strings of the integrator."""
+    """Write ``scene.xml``: a ball of surfels, four cameras around it; ``properties`` are strings of the integrator. Beside it
+    lies another light, ``light.exr``."""
     write_ply(folder / "object.ply", sphere_surfels(count, seed=5, opacity_shift=3).numpy())
     if integrator == "rgs_deferred":
         properties["indirect"] = indirect
@@ -40,6 +42,7 @@ def write_scene(folder: Path, integrator="rgs_deferred", indirect="one_bounce", 
         properties=" ".join(f'<string name="{name}" value="{value}"/>' for name, value in properties.items()),
         sensors="\n".join(_SENSOR.format(k=k, x=4 * np.cos(a), y=4 * np.sin(a)) for k, a in enumerate(angles)),
     )
+    write_exr(folder / "light.exr", np.random.default_rng(2).uniform(0, 2, (8, 16, 3)) ** 3)
     (folder / "scene.xml").write_text(text)
     return folder / "scene.xml"
 

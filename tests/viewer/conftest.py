@@ -18,6 +18,6 @@ def scene_file(tmp_path_factory):
 def subject(scene_file):
     """What there is to see of it, with photographs, which no test changes."""
     rgs_mi.set_variant()
-    subject = Subject.of(load_scene(scene_file, {}))
+    subject = Subject.of(load_scene(scene_file, {}), [scene_file.with_name("light.exr")])
     subject.compare_with(photographs(subject))
     return subject
