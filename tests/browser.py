@@ -20,8 +20,8 @@ _WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gp
 
 @contextmanager
 def open_tab(dark: bool = False, webgl: bool = False):
-    """An empty `playwright.sync_api.Page`, 1280 by 900, which draws by ``webgl`` where asked. It has two lists more: ``errors``, what its documents complained
-    about, and ``requests``, addresses that they asked for, but for data."""
+    """An empty `playwright.sync_api.Page`, 1280 by 900, which has WebGL where asked. It has two lists more: ``errors``, what its
+    documents complained about, and ``requests``, addresses that they asked for, but for data."""
     playwright = pytest.importorskip("playwright.sync_api", reason="needs Playwright: pip install playwright")
     program = next(filter(None, map(shutil.which, NAMES)), None)
     if not program:
