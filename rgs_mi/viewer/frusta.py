@@ -23,6 +23,8 @@ class Frusta:
     def __init__(self, client: "viser.ClientHandle", window: "Window", subject: Subject) -> None:
         self._client, self._window, self._subject = client, window, subject
         self._handles = []
+        self._poses = np.array([view.camera.to_world for view in subject.views]).reshape(-1, 4, 4)
+        self._distances = np.linalg.norm(self._poses[:, :3, 3] - subject.center, axis=1)
 
     def show(self, visible: bool) -> None:
         """Show or hide them; they are made the first time."""
@@ -30,8 +32,7 @@ class Frusta:
             self._handles = [self._make(k, view) for k, view in enumerate(self._subject.views)]
         for handle in self._handles:
             handle.visible = visible
-        self._window.with_depth = visible
-        self._window.redraw()
+        self._window.overlay("photographs", visible)
 
     def _make(self, k, view):
         camera = view.camera
@@ -66,9 +67,7 @@ class Frusta:
 
     def through(self, camera: Camera) -> str | None:
         """Return the name of the photograph in whose place ``camera`` stands, or None."""
-        for view in self._subject.views:
-            own, distance = view.camera, np.linalg.norm(view.camera.origin - self._subject.center)
-            there = np.linalg.norm(camera.origin - own.origin) < _NEAR * distance
-            if there and (camera.to_world[:3, :3] * own.to_world[:3, :3]).sum(0).min() > 1 - _NEAR:
-                return view.name
-        return None
+        apart = np.linalg.norm(self._poses[:, :3, 3] - camera.origin, axis=1)
+        cosines = (self._poses[:, :3, :3] * camera.to_world[:3, :3]).sum(1).min(1)
+        there = np.flatnonzero((apart < _NEAR * self._distances) & (cosines > 1 - _NEAR))
+        return self._subject.views[there[0]].name if len(there) else None

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _SHARE = 0.08  # of the fit's time that pictures may take
 _DEBT, _CREDIT = -0.25, 0.25  # seconds of it that are carried on, at most
+_GRIDS = 2  # of `pace.GRIDS`, the smallest: there is no time for more
 _RENEW = 0.5  # seconds from one state of the surfels that is shown to the next, at least
 
 
@@ -55,11 +56,11 @@ class Watch:
                 self._server.wake.clear()
         self._hurry(True)
         while self._credit > 0:
-            start, cold = time.perf_counter(), self._server.pace.cold is not None
+            start, warm = time.perf_counter(), len(self._server.pace.seconds)
             self._renew()
-            worked = self._server.turn(idle=False)
-            spent = 0 if cold else time.perf_counter() - start  # what is compiled once is compiled once
-            self._credit = max(self._credit - spent, _DEBT)
+            worked = self._server.turn(idle=warm < _GRIDS)
+            if len(self._server.pace.seconds) == warm:  # what is compiled once costs no share
+                self._credit = max(self._credit - (time.perf_counter() - start), _DEBT)
             if not worked:
                 break
 

@@ -56,6 +56,8 @@ def display(name: str, measured: Mapping[str, np.ndarray], shown: Shown) -> np.n
     passes."""
     values, alpha = measured[MAPS[name]], np.clip(measured["alpha"], 0, 1)
     over = _GREY[shown.background]
+    if "behind" in measured:
+        return exposed(values + measured["behind"], shown.stops, shown.tone)
     if name == "alpha":
         return np.repeat(alpha, 3, -1)
     if name == "normals":

@@ -13,15 +13,16 @@ from .film import Film
 from .frusta import Frusta
 from .look import BACKGROUNDS, OWN
 from .maps import MAPS
+from .pace import GRIDS
 from .passes import SAMPLES, point_at
-from .window import Picture, Window
+from .window import Picture, Window, seen
 
 if TYPE_CHECKING:
     import viser
 
     from .server import Server
 
-_PICK = 200  # points along a side of the picture in which a click is looked up
+_PICK = GRIDS[1]  # points along a side of the picture in which a click is looked up
 
 
 class Panel:
@@ -155,7 +156,7 @@ class Panel:
 
         def pick():
             look, subject = self._window.look, self._server.subject
-            point = point_at(subject, look, look.camera.resized(_PICK, _PICK), x, y)
+            point = point_at(subject, look, seen(subject, look).resized(_PICK, _PICK), x, y)
             radius = number(self._radius.value, 1e-3 * subject.radius, subject.radius)
             if point is not None and radius is not None:
                 self._region(tuple(map(float, point)), radius)
@@ -171,6 +172,7 @@ class Panel:
             self._ball = self._client.scene.add_icosphere(
                 "/region", radius, (240, 150, 40), subdivisions=1, wireframe=True, position=center
             )
+        self._window.overlay("region", center is not None)
         self._window.change(region=None if center is None else (*center, radius))
 
     def _keep(self):
@@ -192,6 +194,7 @@ class Panel:
 
     def _tell_command(self):
         look, subject = self._window.look, self._server.subject
+        look = replace(look, camera=seen(subject, look))
         distance = float(np.linalg.norm(look.camera.origin - subject.center))
         lines = [look.command(self._server.name, distance)]
         if keys := self._film.keys:

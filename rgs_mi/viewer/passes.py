@@ -26,7 +26,8 @@ def offset(sample: int, side: int = SIDE) -> tuple[float, float]:
 
 
 def measure(subject: Subject, look: Look, camera: Camera, settled: bool, side: int = 1) -> dict[str, np.ndarray]:
-    """Return what the map of ``look`` needs, and ``alpha``, of what ``camera`` sees: [H, W, channels] each, premultiplied.
+    """Return what the map of ``look`` needs, ``alpha`` and ``depth`` of what ``camera`` sees: [H, W, channels] each,
+    premultiplied, and what of the light shows ``behind`` it, where it is to be seen.
     ``settled`` is that of `Subject.lit`; a pixel is one of ``side`` × ``side`` samples."""
     lit, name, (width, height) = subject.lit(look, settled), MAPS[look.map], camera.size
     turntable = subject.turntable(look)
@@ -43,8 +44,7 @@ def measure(subject: Subject, look: Look, camera: Camera, settled: bool, side: i
         measured |= {key: gbuffer[..., GBUFFER[key]] for key in {name, "alpha", "depth"} & GBUFFER.keys()}
         if look.background == "light" and look.map == "picture" and lit.environment is not None:
             radiance = rows(mi.TensorXf(dr.ravel(deferred.behind(camera, lit.environment, turntable))))
-            measured["color"] = measured["color"] + (1 - measured["alpha"]) * radiance
-            measured["alpha"] = np.ones_like(measured["alpha"])
+            measured["behind"] = (1 - measured["alpha"]) * radiance
     return measured
 
 

@@ -41,7 +41,8 @@ class Window:
     def __init__(self, look: Look, wake: Callable[[], None] = lambda: None) -> None:
         self.look, self.generation, self.moved = look, 0, time.monotonic()
         self.refined = Refined()
-        self.with_depth = self.hurried = False
+        self.hurried = False
+        self._overlays: set[str] = set()
         self._lock, self._wake = threading.Lock(), wake
         self._moving, self._refining = -1, -1  # generations that were drawn, and that are being refined
 
@@ -54,10 +55,16 @@ class Window:
             self.look, self.generation, self.moved = look, self.generation + 1, time.monotonic()
         self._wake()
 
+    def overlay(self, name: str, shown: bool) -> None:
+        """Take note of an object that the browser draws among the surfels, which hide it: pictures then have a depth."""
+        (self._overlays.add if shown else self._overlays.discard)(name)
+        self.redraw()
+
     def redraw(self) -> None:
         """Draw anew: what is looked at has changed."""
         with self._lock:
             self.generation += 1
+        self._wake()
 
     @property
     def moving(self) -> bool:
@@ -104,7 +111,7 @@ class Window:
         return Picture(pixels, None if self.refined.samples >= SAMPLES else _AT_REST, self._depth(self.refined.means))
 
     def _depth(self, measured):
-        if not self.with_depth or "depth" not in measured:
+        if not self._overlays or "depth" not in measured:
             return None
         alpha, depth = measured["alpha"][..., 0], measured["depth"][..., 0]
         return np.where(alpha > 0.5, depth / np.maximum(alpha, 1e-6), _FAR)

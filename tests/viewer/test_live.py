@@ -9,6 +9,7 @@ import pytest
 from rgs_mi.fit.trainer import Fit
 from rgs_mi.viewer import live
 from rgs_mi.viewer.look import Look
+from rgs_mi.viewer.pace import GRIDS
 from rgs_mi.viewer.window import Window
 
 from fits import SETTINGS, model
@@ -63,7 +64,7 @@ def test_nobody_looks(watch, monkeypatch):
 def test_somebody_looks(watch):
     """Pictures follow the fit, and take their share of its time."""
     window, panel = enter(watch)
-    watch._server.pace.seconds = {128: 0.01}
+    watch._server.pace.seconds = dict.fromkeys(GRIDS, 0.01)
     for _ in range(3):
         watch._fit.step()
         watch.between()
