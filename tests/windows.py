@@ -63,3 +63,13 @@ def psnr(a, b):
     """In dB, of pictures of 8 bits, or of display values in [0, 1]."""
     scale = 255 if np.asarray(a).dtype == np.uint8 else 1
     return -10 * np.log10(max(np.mean((np.float64(a) / scale - np.float64(b) / scale) ** 2), 1e-12))
+
+
+class Panel:
+    """Takes pictures as `rgs_mi.viewer.panel.Panel` does."""
+
+    def __init__(self):
+        self.pictures = []
+
+    def show(self, picture):
+        self.pictures.append(picture)

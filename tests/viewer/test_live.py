@@ -14,6 +14,7 @@ from rgs_mi.viewer.window import Window
 
 from fits import SETTINGS, model
 from scenes import orbit_camera
+from windows import Panel
 
 
 class Controls:
@@ -23,14 +24,6 @@ class Controls:
 
     def tell(self, fit):
         self.told += 1
-
-
-class Panel:
-    def __init__(self):
-        self.pictures = []
-
-    def show(self, picture):
-        self.pictures.append(picture)
 
 
 @pytest.fixture

@@ -15,18 +15,9 @@ from rgs_mi.viewer.server import Server
 from rgs_mi.viewer.window import Window
 
 from scenes import orbit_camera
+from windows import Panel
 
 CAMERA = orbit_camera(0.7, size=(56, 48))
-
-
-class Panel:
-    """Takes pictures as `panel.Panel` does."""
-
-    def __init__(self):
-        self.pictures = []
-
-    def show(self, picture):
-        self.pictures.append(picture)
 
 
 @pytest.fixture
