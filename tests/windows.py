@@ -11,7 +11,7 @@ from rgs_mi.surfels.ply import write_ply
 from rgs_mi.viewer import passes
 from rgs_mi.viewer.look import Look
 
-from scenes import orbit_camera, sphere_surfels
+from scenes import orbit_camera, tangent_surfels
 
 _SENSOR = """    <sensor type="perspective" id="r_{k}">
         <transform name="to_world"> <lookat origin="{x}, {y}, 0.8" target="0, 0, 0" up="0, 0, 1"/> </transform>
@@ -31,9 +31,14 @@ _SCENE = """<scene version="3.0.0">
 
 
 def write_scene(folder: Path, integrator="rgs_deferred", indirect="one_bounce", count=1500, **properties) -> Path:
-    """Write ``scene.xml``: a ball of surfels, four cameras around it; ``properties`` are strings of the integrator. Beside it
-    lies another light, ``light.exr``."""
-    write_ply(folder / "object.ply", sphere_surfels(count, seed=5, opacity_shift=3).numpy())
+    """Write ``scene.xml``: two balls of surfels, four cameras around them; ``properties`` are strings of the integrator. Beside
+    it lies another light, ``light.exr``."""
+    ball, other = (tangent_surfels(n).numpy() for n in (count, count // 2))
+    other |= {"centers": 0.5 * other["centers"] + (1.1, 0.6, 0.4), "scales": 0.5 * other["scales"]}
+    surfels = {name: np.concatenate([ball[name], other[name]]) for name in ball}
+    shade = 0.5 + 0.5 * np.sin(3 * surfels["centers"])
+    materials = {"roughness": 0.1 + 0.3 * shade[:, :1], "metallic": shade[:, 1:2], "base_color": 0.2 + 0.7 * shade}
+    write_ply(folder / "object.ply", surfels | materials | {"sh": np.tile(surfels["sh"].mean(0), (len(shade), 1))})
     if integrator == "rgs_deferred":
         properties["indirect"] = indirect
     angles = np.linspace(0.3, 5, 4)
@@ -52,9 +57,11 @@ def photographs(subject) -> list[View]:
     views = []
     for k, angle in enumerate((0.0, 1.5, 4.0)):
         camera = orbit_camera(angle, size=(60, 50))
-        measured = passes.measure(subject, Look(camera), camera, settled=True)
-        alpha = np.clip(measured["alpha"], 0, 1)
-        color = exposed(measured["color"] / np.maximum(alpha, 1e-6))
+        refined = passes.Refined()
+        for _ in range(passes.SAMPLES):
+            refined.add(subject, Look(camera))
+        alpha = np.clip(refined.means["alpha"], 0, 1)
+        color = exposed(refined.means["color"] / np.maximum(alpha, 1e-6))
         views.append(View(f"p_{k}", camera, to_8bit(np.concatenate([color, alpha], -1)), True, None, Path(f"p_{k}.png")))
     return views
 

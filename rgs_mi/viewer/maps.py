@@ -67,7 +67,7 @@ def display(name: str, measured: Mapping[str, np.ndarray], shown: Shown) -> np.n
     if name in ("picture", "diffuse", "specular"):
         mean = exposed(values / np.maximum(alpha, 1e-6), shown.stops, shown.tone)
     else:
-        mean = _VALUES[name](values / np.maximum(alpha, 1e-6), shown)
+        mean = np.broadcast_to(_VALUES[name](values / np.maximum(alpha, 1e-6), shown), (*alpha.shape[:2], 3))
     return mean * alpha + over * (1 - alpha)
 
 

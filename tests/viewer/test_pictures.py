@@ -47,7 +47,7 @@ def paced(seconds_a_point, fixed=0.002):
 def test_sizes_follow_the_machine():
     fastest, slowest = paced(1e-8), paced(1e-3)
     assert fastest.choose() == GRIDS[-1] and slowest.choose() == GRIDS[0]
-    chosen = paced(0.7e-6)
+    chosen = paced(0.9e-6)
     grid = chosen.choose()
     assert grid in GRIDS[1:-1] and chosen.seconds[grid] < 1 / RATE < chosen.seconds[GRIDS[GRIDS.index(grid) + 1]]
     assert chosen.choose(windows=4) < grid
@@ -55,7 +55,7 @@ def test_sizes_follow_the_machine():
 
 
 def test_sizes_follow_what_frames_take():
-    pace = paced(0.7e-6)
+    pace = paced(0.9e-6)
     first = pace.choose()
     for _ in range(30):
         pace.note(first, 3 * pace.seconds[first])
@@ -150,7 +150,8 @@ def test_a_move_interrupts_what_is_at_rest(subject, monkeypatch):
     assert seen.due() == 0 and seen.work(subject, pace) is not None and seen.refined.samples == 1
 
 
-def test_motion_then_rest(subject):
+def test_motion_then_rest(subject, monkeypatch):
+    monkeypatch.setattr(window, "REST", 100)
     seen, pace = window.Window(Look(CAMERA)), paced(1e-8)
     assert seen.due() == 0
     moving = seen.work(subject, pace)
@@ -220,7 +221,7 @@ def test_maps_differ_and_are_colors(subject):
 def test_error_is_none_in_the_place_of_a_photograph(subject):
     view = subject.views[1]
     look = Look(view.camera, map="error")
-    assert seen(subject, look, 1).min() > 0.97  # white: the photograph is what was rendered there
+    assert seen(subject, look).min() > 0.97  # white: the photograph is what was rendered there
     elsewhere = replace(look, camera=replace(view.camera, to_world=orbit_camera(1.7).to_world))
     assert np.array_equal(seen(subject, elsewhere, 1), seen(subject, look, 1))  # compared where the photograph was taken
     assert seen(subject, replace(look, rotate=90), 1).min() < 0.8
@@ -233,7 +234,7 @@ def test_photograph_under_a_slider(subject):
     expected = maps.photograph(view, view.camera, "white")
     assert psnr(expected, video_free(view)) > 60
     assert np.array_equal(shown[:, : width // 2], expected[:, : width // 2].astype(shown.dtype))
-    assert psnr(shown[:, width // 2 :], expected[:, width // 2 :]) < 60
+    assert psnr(shown[:, width // 2 :], expected[:, width // 2 :]) < 50
     wide = replace(view.camera, size=(90, 50), principal=(45.0, 25.0))
     assert psnr(maps.photograph(view, wide, "white")[:, 15:75], expected) > 60  # the same pixels in a wider window
 
