@@ -58,7 +58,7 @@ def photographs(subject) -> list[View]:
     for k, angle in enumerate((0.0, 1.5, 4.0)):
         camera = orbit_camera(angle, size=(60, 50))
         refined = passes.Refined()
-        for _ in range(passes.SAMPLES):
+        while not refined.complete:
             refined.add(subject, Look(camera))
         alpha = np.clip(refined.means["alpha"], 0, 1)
         color = exposed(refined.means["color"] / np.maximum(alpha, 1e-6))

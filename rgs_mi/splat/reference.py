@@ -15,7 +15,7 @@ import numpy as np
 from ..core.camera import Camera, opaque
 from .gbuffer import Maps
 from .project import NEAR
-from .tiles import BLOCK, Cutoffs
+from .tiles import BLOCK, LOW_PASS, Cutoffs
 
 if TYPE_CHECKING:
     from ..surfels.surfels import Surfels
@@ -36,7 +36,7 @@ def _about(lens, x, y, dx, dy):
     return x + (yy * dx - xy * dy) * inverse, y + (xx * dy - yx * dx) * inverse
 
 
-def _front_to_back(surfels, camera, low_pass) -> np.ndarray:
+def _front_to_back(surfels, camera) -> np.ndarray:
     """[pixels, N] indices of the surfels in front of the camera, by the depth at which the ray through the middle of the
     pixel's block meets them."""
     (width, height), camera = camera.size, camera.baked()
@@ -56,7 +56,7 @@ def _front_to_back(surfels, camera, low_pass) -> np.ndarray:
         t = (center * normal).sum(-1) / (ray * normal).sum(-1)  # [rows, columns, N]
         offset = t[..., None] * ray - center
         on_plane = ((offset * t_u).sum(-1) / scales[:, 0]) ** 2 + ((offset * t_v).sum(-1) / scales[:, 1]) ** 2
-    on_screen = low_pass * ((middle - projected) ** 2).sum(-1)
+    on_screen = LOW_PASS * ((middle - projected) ** 2).sum(-1)
     depth = np.where((t > 0) & (on_plane <= on_screen), t, center[:, 2])
     order = front[np.argsort(depth, axis=-1, kind="stable")]
     return order.repeat(BLOCK[1], 0).repeat(BLOCK[0], 1)[:height, :width].reshape(width * height, -1).astype(np.uint32)
@@ -69,7 +69,7 @@ def render_gbuffer_reference(surfels: "Surfels", camera: Camera, cutoffs: Cutoff
 
     centers = surfels.column(mi.Point3f, "centers")
     depth = (rotation @ (centers - origin)).z
-    order = _front_to_back(surfels, camera, cutoffs.low_pass)
+    order = _front_to_back(surfels, camera)
     n = order.shape[1]
     surfel = mi.UInt32(order.ravel())  # pixel-major, front to back
     pixel = dr.arange(mi.UInt32, width * height * n) // n
@@ -87,7 +87,7 @@ def render_gbuffer_reference(surfels: "Surfels", camera: Camera, cutoffs: Cutoff
     t = facing / dr.dot(d, normal)
     u, v = dr.dot(t * d - center, t_u) / scales.x, dr.dot(t * d - center, t_v) / scales.y
     on_plane = dr.select(t > 0, u * u + v * v, dr.largest(mi.Float))
-    on_screen = cutoffs.low_pass * dr.squared_norm(offset)
+    on_screen = LOW_PASS * dr.squared_norm(offset)
     alpha = of(mi.Float, "opacities") * dr.exp(-0.5 * dr.minimum(on_plane, on_screen))
     alpha = dr.select(alpha > cutoffs.alpha_min, dr.minimum(alpha, cutoffs.alpha_max), 0)
     dr.eval(alpha)

@@ -5,7 +5,7 @@ shades a block of 2 × 2 pixels, so a projected Gaussian fetched once serves fou
 before it is scattered. Measured against lanes of one pixel: 1.6 times faster backward.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -28,19 +28,12 @@ class Cutoffs:
     resort_window      how many surfels a block holds back to bring them into its own order (StopThePop, Radl et al. 2024).
                        Fewer leave seams between tiles: on a fitted helmet, two grids of tiles differ by 33 dB without any,
                        by 37, 40 and 46 dB with 4, 8 and 16
-    low_pass           `LOW_PASS`, more of it for one of several samples of a pixel
     """
 
     alpha_min: float = 1 / 255
     alpha_max: float = 0.99
     transmittance_min: float = 1e-4
     resort_window: int = 16
-    low_pass: float = LOW_PASS
-
-    def of_sample(self, side: int) -> "Cutoffs":
-        """Return the same for one of ``side`` × ``side`` samples of a pixel, which are as far from each other as pixels of
-        `Camera.subdivided`, and filtered as these are."""
-        return replace(self, low_pass=self.low_pass * side * side)
 
 
 def tile_grid(size: tuple[int, int]) -> tuple[int, int]:

@@ -103,9 +103,9 @@ def made(subject: Subject, look: Look, keys: list[Camera], frames: int) -> Itera
         files = []
         for k, camera in enumerate(smooth_path(keys, frames)):
             refined, view = Refined(_SIDE), replace(look, camera=camera, through=None)
-            for _ in range(_SIDE**2):
+            while not refined.complete:
                 refined.add(subject, view)
-                yield (k + refined.samples / _SIDE**2) / frames
+                yield (k + refined.passes / refined.total) / frames
             picture = picture_of(subject, view, seen(subject, view), refined.means)
             files.append(Path(folder) / f"{k:03}.png")
             write_png(files[-1], to_8bit(picture))

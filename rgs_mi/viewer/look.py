@@ -2,7 +2,7 @@
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -127,8 +127,3 @@ def quaternion(to_world: np.ndarray) -> np.ndarray:
 
     x, y, z, w = Rotation.from_matrix(to_world[:3, :3]).as_quat()
     return np.array([w, x, y, z])
-
-
-def shifted(camera: Camera, dx: float, dy: float) -> Camera:
-    """Return the camera whose pixel centers are moved by (dx, dy) pixels."""
-    return replace(camera, principal=(camera.principal[0] - dx, camera.principal[1] - dy))

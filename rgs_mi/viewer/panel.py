@@ -14,7 +14,7 @@ from .frusta import Frusta
 from .look import BACKGROUNDS, OWN
 from .maps import MAPS
 from .pace import GRIDS
-from .passes import SAMPLES, point_at
+from .passes import point_at
 from .window import Picture, Window, seen
 
 if TYPE_CHECKING:
@@ -212,7 +212,7 @@ class Panel:
             jpeg_quality=picture.quality,
             depth=picture.depth,
         )
-        refined, (height, width) = self._window.refined.samples, picture.pixels.shape[:2]
-        state = f"{width} × {height}" + ("" if self._window.moving else f", {refined} of {SAMPLES} samples")
+        refined, (height, width) = self._window.refined, picture.pixels.shape[:2]
+        state = f"{width} × {height}" + ("" if self._window.moving else f", {100 * refined.passes // refined.total}%")
         if self._status.content != state:
             self._status.content = state

@@ -9,32 +9,22 @@ import numpy as np
 from ..core.camera import Camera
 from ..export.render import sensor_dict
 from ..shading import deferred
-from ..splat.tiles import Cutoffs
-from .look import Look, shifted
+from ..splat.tiles import TILE
+from .look import Look
 from .maps import GBUFFER, MAPS, SHADED
 from .subject import Subject
 
-SIDE = 4
-SAMPLES = SIDE * SIDE  # of a picture at rest: a grid in each pixel
-_STRIDE = 7  # between places of the grid that follow each other: means of a few are centered, too
+SIDE = 4  # of the grid of samples in each pixel of a picture at rest
 
 
-def offset(sample: int, side: int = SIDE) -> tuple[float, float]:
-    """Return how far the ``sample`` of ``side`` × ``side`` lies from the middle of its pixel, x and y in pixels."""
-    row, column = divmod(_STRIDE * sample % side**2, side)
-    return (column + 0.5) / side - 0.5, (row + 0.5) / side - 0.5
-
-
-def measure(subject: Subject, look: Look, camera: Camera, settled: bool, side: int = 1) -> dict[str, np.ndarray]:
+def measure(subject: Subject, look: Look, camera: Camera, settled: bool) -> dict[str, np.ndarray]:
     """Return what the map of ``look`` needs, ``alpha`` and ``depth`` of what ``camera`` sees: [H, W, channels] each,
     premultiplied, and what of the light shows ``behind`` it, where it is to be seen.
-    ``settled`` is that of `Subject.lit`; a pixel is one of ``side`` × ``side`` samples."""
+    ``settled`` is that of `Subject.lit`."""
     lit, name, (width, height) = subject.lit(look, settled), MAPS[look.map], camera.size
     turntable = subject.turntable(look)
     with dr.suspend_grad():
-        image = deferred.render(
-            lit.surfels, camera, lit.lighting if name in SHADED else None, cutoffs=Cutoffs().of_sample(side)
-        )
+        image = deferred.render(lit.surfels, camera, lit.lighting if name in SHADED else None)
         rows = lambda array: array.numpy().reshape(height, width, -1)
         measured = {}
         if name in SHADED:
@@ -50,29 +40,59 @@ def measure(subject: Subject, look: Look, camera: Camera, settled: bool, side: i
 
 @dataclass
 class Refined:
-    """The means of ``samples`` passes over a picture, of ``side`` × ``side`` that make it complete."""
+    """A picture at rest, by and by: first with one sample a pixel, and then, band by band from above, with ``side`` × ``side``, on
+    the very grid of `rgs_deferred`: complete, it is what that renders. Every pass takes about as many samples as there are pixels.
+    What the scene's own integrator renders instead, has another sample in each pixel after each pass.
+
+    ``passes``: that were made, of `total`; ``means``: what they measured, [H, W, channels].
+    """
 
     side: int = SIDE
-    samples: int = 0
+    passes: int = 0
     means: dict[str, np.ndarray] = field(default_factory=dict)
     _sensor: "mi.Sensor | None" = None
 
+    @property
+    def total(self) -> int:
+        """Passes of a complete picture."""
+        return self.side**2 + 1
+
+    @property
+    def complete(self) -> bool:
+        """Whether there is nothing to add."""
+        return self.passes >= self.total
+
     def add(self, subject: Subject, look: Look) -> None:
-        """Add another sample to each pixel of the picture of ``look``, always the same one."""
+        """Make the next pass over the picture of ``look``, always the same one."""
         if subject.still is not None and look.map == "picture":
             measured = self._traced(subject, look.camera)
+            part = 1 / (self.passes + 1)
+            self.means = {name: values * part + self.means.get(name, 0) * (1 - part) for name, values in measured.items()}
+        elif self.passes == 0:
+            self.means = {name: np.array(v) for name, v in measure(subject, look, look.camera, settled=True).items()}
         else:
-            shift = offset(self.samples, self.side)
-            measured = measure(subject, look, shifted(look.camera, *shift), settled=True, side=self.side)
-        self.samples += 1
+            self._band(subject, look)
+        self.passes += 1
+
+    def _band(self, subject, look):
+        """All samples of a band of pixels; the last one may reach below the picture, so that all are of one size."""
+        fine, side = look.camera.subdivided(self.side**2)
+        rows = (
+            -(-fine.size[1] // (self.side**2 * TILE[1])) * TILE[1]
+        )  # whole tiles: their grid is that of all of the picture
+        top = (self.passes - 1) * rows
+        if top >= fine.size[1]:
+            return
+        measured = measure(subject, look, fine.cropped(0, top, fine.size[0], rows), settled=True)
         for name, values in measured.items():
-            before = self.means.get(name)
-            self.means[name] = values if before is None else before + (values - before) / self.samples
+            samples = values.reshape(rows // side, side, look.camera.size[0], side, -1)
+            before = self.means[name][top // side : (top + rows) // side]
+            before[:] = samples.mean((1, 3))[: len(before)]
 
     def _traced(self, subject, camera):
         """One sample a pixel by the scene's own integrator."""
         (scene, integrator), self._sensor = subject.still, self._sensor or mi.load_dict(sensor_dict(camera))
-        image = np.array(mi.render(scene, sensor=self._sensor, integrator=integrator, spp=1, seed=self.samples))
+        image = np.array(mi.render(scene, sensor=self._sensor, integrator=integrator, spp=1, seed=self.passes))
         return {"color": image[..., :3], "alpha": image[..., 3:4]}
 
 

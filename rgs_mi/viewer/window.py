@@ -12,11 +12,12 @@ from ..core.color import to_8bit
 from . import maps
 from .look import Look, same
 from .pace import Pace
-from .passes import SAMPLES, Refined, measure
+from .passes import Refined, measure
 from .subject import Subject
 
 REST = 0.2  # seconds without an event
 _MOVING, _AT_REST = 40, 80  # quality of JPEGs; a picture that is complete is sent without loss
+_EVERY = 4  # passes from one picture that is shown at rest to the next
 _FAR = 160.0  # world units: depth where nothing is
 
 
@@ -77,7 +78,7 @@ class Window:
             return 0.0
         if self.hurried:
             return float("inf")
-        if self._refining != self.generation or self.refined.samples < SAMPLES:
+        if self._refining != self.generation or not self.refined.complete:
             return max(0.0, self.moved + REST - time.monotonic())
         return float("inf")
 
@@ -105,10 +106,10 @@ class Window:
         self.refined.add(subject, look)
         if self.generation != generation:
             return None
-        if self.refined.samples & (self.refined.samples - 1):  # shown after 1, 2, 4, 8 and 16
+        if (self.refined.passes - 1) % _EVERY and not self.refined.complete:
             return None
         pixels = to_8bit(picture_of(subject, look, look.camera, self.refined.means))
-        return Picture(pixels, None if self.refined.samples >= SAMPLES else _AT_REST, self._depth(self.refined.means))
+        return Picture(pixels, None if self.refined.complete else _AT_REST, self._depth(self.refined.means))
 
     def _depth(self, measured):
         if not self._overlays or "depth" not in measured:

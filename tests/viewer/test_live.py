@@ -70,7 +70,7 @@ def test_somebody_looks(watch):
         spent += time.perf_counter() - start
     assert spent < 0.08 * (fit.elapsed - elapsed) + 0.5 + 0.25  # what was carried on, and the last picture
     assert len(panel.pictures) > drawn and watch._controls[1].told > 1
-    assert panel.pictures[-1].pixels.std() > 5 and window.refined.samples == 0  # never at rest while the fit goes on
+    assert panel.pictures[-1].pixels.std() > 5 and window.refined.passes == 0  # never at rest while the fit goes on
 
 
 def test_what_is_shown_is_the_fit(watch):
@@ -91,9 +91,9 @@ def test_pause_and_stop(watch):
     watch._server.pace.seconds = {128: 0.01}
     watch._fit.step()
     watch.paused = True
-    threading.Thread(target=_until, args=(lambda: window.refined.samples >= 4, watch), daemon=True).start()
+    threading.Thread(target=_until, args=(lambda: window.refined.passes >= 4, watch), daemon=True).start()
     watch.between()
-    assert window.refined.samples >= 4 and watch.stopped
+    assert window.refined.passes >= 4 and watch.stopped
 
 
 def _until(condition, watch):

@@ -29,7 +29,7 @@ def test_it_renders_between_cells(scene_file):
         server._turns.append(1)
         work = window.work
         window.work = lambda *arguments: threads.add(threading.current_thread()) or work(*arguments)
-        while window.refined.samples < 16:
+        while not window.refined.complete:
             await asyncio.sleep(0.02)
         shown.stop()
         await asyncio.sleep(0)

@@ -89,11 +89,11 @@ def test_windows_take_turns(server):
         window.moved -= 1  # at rest
     for _ in range(8):
         assert server.turn(idle=False)
-    assert first.refined.samples == second.refined.samples == 4 and len(one.pictures) == len(two.pictures) == 3
+    assert first.refined.passes == second.refined.passes == 4 and len(one.pictures) == len(two.pictures) == 1
     server.windows.pop(1)  # it vanishes
-    for _ in range(12):
+    for _ in range(13):
         assert server.turn(idle=False)
-    assert not server.turn(idle=False) and first.refined.samples == 4 and second.refined.samples == 16
+    assert not server.turn(idle=False) and first.refined.passes == 4 and second.refined.complete
 
 
 def test_the_last_move_counts(server):
@@ -110,8 +110,8 @@ def test_it_sleeps_until_something_is_due(server):
     end, turns = time.monotonic() + 20, []
     turn = server.turn
     server.turn = lambda: turns.append(1) or turn(idle=False)
-    server.run(until=lambda: window.refined.samples >= 16 or time.monotonic() > end)
-    assert len(panel.pictures) == 6 and len(turns) < 30  # in motion, 1, 2, 4, 8, 16
+    server.run(until=lambda: window.refined.complete or time.monotonic() > end)
+    assert len(panel.pictures) == 6 and len(turns) < 30  # in motion, and after 1, 5, 9, 13, 17 passes
 
 
 def test_what_was_asked_for_comes_first(server):
