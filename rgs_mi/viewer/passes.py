@@ -40,9 +40,9 @@ def measure(subject: Subject, look: Look, camera: Camera, settled: bool) -> dict
 
 @dataclass
 class Refined:
-    """A picture at rest, by and by: first with one sample a pixel, and then, band by band from above, with ``side`` × ``side``, on
-    the very grid of `rgs_deferred`: complete, it is what that renders. Every pass takes about as many samples as there are pixels.
-    What the scene's own integrator renders instead, has another sample in each pixel after each pass.
+    """A picture at rest, by and by: first with one sample a pixel, and then, band by band from above, with ``side`` × ``side`` on
+    the very grid of `rgs_deferred`: complete, it is what that renders. Every pass has about as many samples as there are
+    pixels. What the scene's own integrator renders instead has another sample in each pixel after each pass.
 
     ``passes``: that were made, of `total`; ``means``: what they measured, [H, W, channels].
     """
