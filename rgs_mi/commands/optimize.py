@@ -28,6 +28,8 @@ from ..priors.initialization import initial_points, surroundings
 from ..report import results
 from ..settings.config import to_dict
 from ..settings.settings import Settings
+from ..viewer import server
+from ..viewer.live import Watch
 
 _ON_SURFACE, _ANYWHERE = 0.7, 0.1  # opacities to start with; where surfels fill space, more would hide what is within
 _SMOOTHING = 0.95  # of the PSNR that the progress line shows
@@ -60,6 +62,8 @@ def optimize(
 
     Raises: UserError for bad input, a package that is missing, a folder that can't be written, and a fit that diverges.
     """
+    if window:
+        server.check(*window)
     scene = FitScene.load(path, data, variables)
     overrides = [*overrides, *budget(minutes), *([f"seed={seed}"] if seed is not None else [])]
     settings = scene.settings(config, overrides)
@@ -87,8 +91,6 @@ def _watched(fit, folder, window):
     """The window on the fit, where someone asked for one. Raises: UserError where it can't be opened."""
     if window is None:
         return None
-    from ..viewer.live import Watch
-
     watch = Watch(fit, str(folder), *window)
     print(watch.address, flush=True)
     return watch

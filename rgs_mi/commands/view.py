@@ -11,7 +11,7 @@ from ..datasets import load_dataset
 from ..datasets.resolution import LONGEST
 from ..export.mitsuba_scene import SCENE
 from ..report.results import METRICS
-from ..viewer.server import HOST, PORT, Server
+from ..viewer.server import HOST, PORT, Server, check
 from ..viewer.subject import Subject
 
 
@@ -35,6 +35,7 @@ def view(
 
     Raises: UserError for a scene that can't be shown, a port that is taken, and where viser is not installed.
     """
+    check(host, port)
     path = Path(path)
     scene = path / SCENE if path.is_dir() else path
     subject = Subject.of(load_scene(scene, variables or {}), envmaps)  # whose light is filtered meanwhile, in a thread

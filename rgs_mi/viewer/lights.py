@@ -1,7 +1,7 @@
 """The environments that a window offers: the scene's own, those of the suite, and files that were named at the start."""
 
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,7 +29,7 @@ class Lights:
         self.names = (OWN, *self._files, *sorted(ENVIRONMENTS))
         self._filtered: dict[str, FilteredEnvironment] = {}
         self._filters = ThreadPoolExecutor(1, "filter")
-        self._first = self._filters.submit(prefilter.prefilter, *own.size, mi.variant())
+        self._operators: dict[tuple[int, int], Future] = {}  # by size, those that were asked for
 
     @property
     def rotation(self) -> np.ndarray:
@@ -39,19 +39,20 @@ class Lights:
     def __getitem__(self, name: str) -> FilteredEnvironment:
         """The environment ``name``; waits where it was not `prepared`."""
         if name not in self._filtered:
-            if name == OWN:
-                self._first.result()
-            self._filtered[name] = self._environment(name).filtered()
+            environment = self._environment(name)
+            if environment.size in self._operators:
+                self._operators[environment.size].result()
+            self._filtered[name] = environment.filtered()
         return self._filtered[name]
 
-    def prepare(self, name: str, ready: Callable[[], None]) -> None:
-        """Call ``ready()``, from another thread, once ``name`` is there without waiting."""
+    def prepare(self, name: str, ready: Callable[[], None] = lambda: None) -> None:
+        """Call ``ready()``, perhaps from another thread, once ``name`` is there without waiting."""
         if name in self._filtered:
-            ready()
-            return
+            return ready()
         size = self._environment(name).size
-        future = self._filters.submit(prefilter.prefilter, *size, mi.variant())
-        future.add_done_callback(lambda _: ready())
+        if size not in self._operators:
+            self._operators[size] = self._filters.submit(prefilter.prefilter, *size, mi.variant())
+        self._operators[size].add_done_callback(lambda _: ready())
 
     def set_own(self, own: FilteredEnvironment) -> None:
         """Put another light in place of the scene's own: that which a fit has found by now."""

@@ -91,9 +91,9 @@ class Watch:
 
 def _subject(fit):
     """What there is to see of a fit."""
-    views, environment = fit.dataset.train, fit.model.environment()
+    views = fit.dataset.train
     with dr.suspend_grad():
-        lights = Lights(environment)
+        lights = Lights(fit.model.environment())
     return Subject(_surfels(fit), fit.shading, None, lights, [view.camera for view in views], list(views), changing=True)
 
 

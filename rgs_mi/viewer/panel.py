@@ -148,7 +148,7 @@ class Panel:
             factors("region_material")
             self._button("forget the region", lambda: self._region(None, 0))
 
-    async def _clicked(self, event):
+    def _clicked(self, event):
         """Make the region one about the point that was clicked on."""
         x, y = (number(v, 0, 1) for v in event.screen_pos)
         if x is None or y is None:

@@ -159,11 +159,9 @@ def _camera(client):
 
 
 def _open(host, port):
-    """viser's server. Raises: UserError where it is not installed, or the port is taken."""
-    try:
-        import viser
-    except ImportError as error:
-        raise UserError("a window needs viser: pip install 'rgs-mi[viewer]'") from error
+    """viser's server. Raises: UserError as `check` does."""
+    check(host, port)
+    import viser
 
     class Page(viser.ViserServer):
         """A page that no one can make public: a message of any window could else ask for a tunnel to the internet."""
@@ -171,7 +169,6 @@ def _open(host, port):
         def request_share_url(self, verbose: bool = True) -> None:
             return None
 
-    _check_free(host, port)
     with contextlib.redirect_stdout(io.StringIO()):  # its own greeting
         page = Page(host=host, port=port, label="rgs_mi", verbose=False)
     if port and page.get_port() != port:  # viser takes the next one, when another was quicker
@@ -180,8 +177,13 @@ def _open(host, port):
     return page
 
 
-def _check_free(host, port):
-    """Raises: UserError where nothing can be bound to."""
+def check(host: str, port: int) -> None:
+    """Check that a page can be opened, before what it shows is loaded. Raises: UserError where viser is not installed, or the port
+    is taken."""
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise UserError("a window needs viser: pip install 'rgs-mi[viewer]'") from error
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, protocol) as probe:

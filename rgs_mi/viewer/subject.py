@@ -83,7 +83,10 @@ class Subject:
             lit = getattr(integrator, "diffuse", "radiance") if emitter else "radiance"
             box = getattr(integrator, "box", None)
             shading, shader = Shading("split_sum" if emitter else "none", lit, eta=eta, box=box), None
-        lights = Lights(Environment.from_emitter(emitter), envmaps) if emitter and shading.specular != "none" else None
+        lights = None
+        if emitter and shading.specular != "none":
+            lights = Lights(Environment.from_emitter(emitter), envmaps)
+            lights.prepare(OWN)
         cameras = [Camera.from_sensor(sensor) for sensor in scene.sensors()] or [_in_front(surfels)]
         return cls(surfels, shading, shader, lights, cameras, still=None if deferred else (scene, integrator))
 

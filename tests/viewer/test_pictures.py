@@ -217,7 +217,7 @@ def test_error_is_none_in_the_place_of_a_photograph(subject):
     look = Look(view.camera, map="error")
     assert seen(subject, look).min() > 0.97  # white: the photograph is what was rendered there
     elsewhere = replace(look, camera=replace(view.camera, to_world=orbit_camera(1.7).to_world))
-    assert np.array_equal(seen(subject, elsewhere, 1), seen(subject, look, 1))  # compared where the photograph was taken
+    assert np.array_equal(seen(subject, elsewhere), seen(subject, look))  # compared where the photograph was taken
     assert seen(subject, replace(look, rotate=90), 1).min() < 0.8
 
 
@@ -239,10 +239,10 @@ def video_free(view):
 
 
 def test_a_click_finds_the_surface(subject):
-    point = passes.point_at(subject, Look(CAMERA), CAMERA, 0.5, 0.5)
-    toward = CAMERA.origin / np.linalg.norm(CAMERA.origin)
-    assert np.linalg.norm(point - toward) < 0.15
-    assert passes.point_at(subject, Look(CAMERA), CAMERA, 0.01, 0.01) is None
+    camera = orbit_camera(3.8, size=(56, 48))
+    point = passes.point_at(subject, Look(camera), camera, 0.5, 0.5)
+    assert np.linalg.norm(point - camera.origin / np.linalg.norm(camera.origin)) < 0.15
+    assert passes.point_at(subject, Look(camera), camera, 0.01, 0.01) is None
 
 
 def test_light_that_is_hidden_settles(tmp_path):
