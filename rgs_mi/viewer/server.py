@@ -178,8 +178,8 @@ def _open(host, port):
 
 
 def check(host: str, port: int) -> None:
-    """Check that a page can be opened, before what it shows is loaded. Raises: UserError where viser is not installed, or the port
-    is taken."""
+    """Check that a page can be opened, before what it shows is loaded. Raises: UserError where viser is not installed, or the
+    port is taken."""
     try:
         import viser  # noqa: F401
     except ImportError as error:
