@@ -263,7 +263,7 @@ def _loop(fit, folder, quiet, events=None, watch=None) -> bool:
                     warnings.warn(f"no checkpoint this time, the fit goes on: {error}", stacklevel=2)
                 saved = time.monotonic()
             if watch:
-                watch.between()
+                watch.between(lambda: interrupt.requested)
                 interrupt.requested |= watch.stopped
         checkpoint.save(folder, *_state(fit, folder))
     return interrupt.requested

@@ -1,7 +1,7 @@
 """Key frames of one window, and the film through them."""
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -77,26 +77,30 @@ class Film:
         self._next(made(self._server.subject, self._window.look, list(self.keys), self.frames))
 
     def _next(self, work):
-        """Do one piece of the ``work``, and ask for the next."""
+        """Do one piece of the ``work`` when no window waits, and ask for the next, while its own window is there."""
 
         def piece():
-            part = next(work, None)
-            if isinstance(part, float):
+            part = None
+            try:
+                part = next(work)
+            except UserError as error:
+                self._tell(str(error))
+            if isinstance(part, float) and self._client.client_id in self._server.windows:
                 self._tell(f"{100 * part:.0f}%")
-            elif part is not None:
+                return self._next(work)
+            if isinstance(part, bytes):
                 self._client.send_file_download("rgs_mi.mp4", part, save_immediately=True)
                 self._tell("done")
-            self._running = part is not None
-            if part is not None:
-                self._next(work)
+            work.close()
+            self._running = False
 
-        self._server.ask(piece)
+        self._server.ask(piece, later=True)
 
     def _tell(self, text):
         self._told.content = text
 
 
-def made(subject: Subject, look: Look, keys: list[Camera], frames: int) -> Iterator[float | bytes]:
+def made(subject: Subject, look: Look, keys: list[Camera], frames: int) -> Generator[float | bytes]:
     """Make a film of ``frames`` on a smooth path through ``keys``, of what ``look`` shows: yield the part that is done after each
     pass, and at last the video."""
     with tempfile.TemporaryDirectory() as folder:

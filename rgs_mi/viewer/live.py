@@ -1,6 +1,7 @@
 """A window on a fit in progress: what surfels are by now, curves, and what someone may tell it to do."""
 
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -42,13 +43,14 @@ class Watch:
         """Close the window."""
         self._server.close()
 
-    def between(self) -> None:
-        """Draw what windows ask for, as far as its share of the time goes; wait while someone has the fit paused."""
+    def between(self, interrupted: Callable[[], bool] = lambda: False) -> None:
+        """Draw what windows ask for, as far as its share of the time goes; wait while someone has the fit paused, and nobody has
+        ``interrupted`` it elsewhere."""
         self._credit = min(self._credit + _SHARE * (self._fit.elapsed - self._elapsed), _CREDIT)
         self._elapsed = self._fit.elapsed
         if not self._server.windows:
             return
-        while self.paused and not self.stopped and self._server.windows:
+        while self.paused and not (self.stopped or interrupted()) and self._server.windows:
             self._renew()
             self._hurry(False)
             if not self._server.turn(idle=False):

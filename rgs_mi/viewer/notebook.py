@@ -7,7 +7,6 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from ..core.runtime import set_variant
 from ..datasets.types import View
 from .server import HOST, Server
 from .subject import Subject
@@ -65,8 +64,6 @@ def show(
 
     Raises: UserError where viser is not installed, the port is taken, or the scene has no surfels.
     """
-    if mi.variant() is None:
-        set_variant()
     subject = Subject.of(scene, envmaps)
     subject.compare_with(views)
     shown = Shown(Server(subject, name, host, port))

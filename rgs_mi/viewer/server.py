@@ -48,6 +48,7 @@ class Server:
         self._entered = entered
         self.wake = threading.Event()
         self._jobs: deque[Callable[[], None]] = deque()  # that windows have asked for
+        self._later: deque[Callable[[], None]] = deque()  # and that can wait
         self._panels: dict[int, Panel] = {}
         self._turns: deque[int] = deque()  # windows, the one that has waited longest first
         self._page = _open(host, port)
@@ -102,14 +103,14 @@ class Server:
 
     # ---- Whose turn it is ----
 
-    def ask(self, job: Callable[[], None]) -> None:
-        """Have ``job()`` done by the thread that renders, in its next turn."""
-        self._jobs.append(job)
+    def ask(self, job: Callable[[], None], later: bool = False) -> None:
+        """Have ``job()`` done by the thread that renders, in its next turn, or ``later``, when no window waits for a picture."""
+        (self._later if later else self._jobs).append(job)
         self.wake.set()
 
     def turn(self, idle: bool = True) -> bool:
-        """Do one piece of work: what a window has asked for, or one pass of the window that has waited longest, or, with nothing
-        else to do and where ``idle`` work is wanted, compile what another size needs. Return whether there was any."""
+        """Do one piece of work: what a window has asked for, or one pass of the window that has waited longest, or what can wait,
+        or, where ``idle`` work is wanted, compile what another size needs. Return whether there was any."""
         if self._jobs:
             self._jobs.popleft()()
             return True
@@ -124,6 +125,9 @@ class Server:
                     self._turns.append(number)
                 self._draw(number, window)
                 return True
+        if self._later:
+            self._later.popleft()()
+            return True
         if idle and self.pace.cold is not None:
             self._warm()
             return True

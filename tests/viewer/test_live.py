@@ -103,6 +103,13 @@ def _until(condition, watch):
     watch.stopped = True
 
 
+def test_an_interrupt_ends_a_pause(watch):
+    enter(watch)
+    watch.paused = True
+    watch.between(lambda: True)
+    assert not watch.stopped
+
+
 def test_windows_that_vanish_do_not_hold_a_paused_fit(watch):
     enter(watch)
     watch.paused = True

@@ -115,10 +115,14 @@ def test_it_sleeps_until_something_is_due(server):
 
 
 def test_what_was_asked_for_comes_first(server):
-    window, panel = enter(server, 1)
+    """And what can wait comes last."""
+    _, panel = enter(server, 1)
     done = []
-    server.ask(lambda: done.append(1))
-    assert server.turn() and done == [1] and panel.pictures == []
+    server.ask(lambda: done.append("later"), later=True)
+    server.ask(lambda: done.append("now"))
+    assert server.turn(idle=False) and done == ["now"] and panel.pictures == []
+    assert server.turn(idle=False) and done == ["now"] and len(panel.pictures) == 1
+    assert server.turn(idle=False) and done == ["now", "later"]
 
 
 def test_values_of_pages_are_checked():
