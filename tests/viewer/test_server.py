@@ -9,6 +9,7 @@ import urllib.request
 import pytest
 
 from rgs_mi.core.errors import UserError
+from rgs_mi.viewer import window
 from rgs_mi.viewer.checks import choice, number
 from rgs_mi.viewer.look import Look
 from rgs_mi.viewer.server import Server
@@ -30,10 +31,10 @@ def server(subject):
 
 def enter(server, number, camera=CAMERA):
     """A window without a browser."""
-    window, panel = Window(Look(camera), server.wake.set), Panel()
-    server.windows[number], server._panels[number] = window, panel
+    opened, panel = Window(Look(camera), server.wake.set), Panel()
+    server.windows[number], server._panels[number] = opened, panel
     server._turns.append(number)
-    return window, panel
+    return opened, panel
 
 
 def test_a_port_that_is_taken_is_one_line(server, subject):
@@ -85,8 +86,8 @@ def test_a_missing_package_is_one_line(subject, monkeypatch):
 def test_windows_take_turns(server):
     """Nobody waits for another's sixteen samples."""
     (first, one), (second, two) = enter(server, 1), enter(server, 2, orbit_camera(2, size=(56, 48)))
-    for window in (first, second):
-        window.moved -= 1  # at rest
+    for opened in (first, second):
+        opened.moved -= 1  # at rest
     for _ in range(8):
         assert server.turn(idle=False)
     assert first.refined.passes == second.refined.passes == 4 and len(one.pictures) == len(two.pictures) == 1
@@ -96,26 +97,28 @@ def test_windows_take_turns(server):
     assert not server.turn(idle=False) and first.refined.passes == 4 and second.refined.complete
 
 
-def test_the_last_move_counts(server):
+def test_the_last_move_counts(server, monkeypatch):
     """A hundred events while a picture is drawn are one picture."""
-    window, panel = enter(server, 1)
+    monkeypatch.setattr(window, "REST", 100)
+    seen, panel = enter(server, 1)
     for k in range(100):
-        window.change(camera=orbit_camera(0.01 * k, size=(56, 48)))
+        seen.change(camera=orbit_camera(0.01 * k, size=(56, 48)))
     assert server.turn(idle=False) and not server.turn(idle=False) and len(panel.pictures) == 1
     assert server.wake.is_set()
 
 
 def test_it_sleeps_until_something_is_due(server):
-    window, panel = enter(server, 1)
+    opened, panel = enter(server, 1)
     end, turns = time.monotonic() + 20, []
     turn = server.turn
     server.turn = lambda: turns.append(1) or turn(idle=False)
-    server.run(until=lambda: window.refined.complete or time.monotonic() > end)
+    server.run(until=lambda: opened.refined.complete or time.monotonic() > end)
     assert len(panel.pictures) == 6 and len(turns) < 30  # in motion, and after 1, 5, 9, 13, 17 passes
 
 
-def test_what_was_asked_for_comes_first(server):
+def test_what_was_asked_for_comes_first(server, monkeypatch):
     """And what can wait comes last."""
+    monkeypatch.setattr(window, "REST", 100)
     _, panel = enter(server, 1)
     done = []
     server.ask(lambda: done.append("later"), later=True)
