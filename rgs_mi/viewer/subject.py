@@ -85,7 +85,8 @@ class Subject:
             shading, shader = Shading("split_sum" if emitter else "none", lit, eta=eta, box=box), None
         lights = None
         if emitter and shading.specular != "none":
-            lights = Lights(Environment.from_emitter(emitter), envmaps)
+            own = replace(Environment.from_emitter(emitter), room=getattr(integrator, "room", None))
+            lights = Lights(own, envmaps)
             lights.prepare(OWN)
         cameras = [Camera.from_sensor(sensor) for sensor in scene.sensors()] or [_in_front(surfels)]
         return cls(surfels, shading, shader, lights, cameras, still=None if deferred else (scene, integrator))
@@ -155,7 +156,7 @@ class Subject:
         shading = replace(self.shading, turntable=self.turntable(look))
         sampled, emitter = shading.specular == "monte_carlo" and settled, None
         if shading.indirect != "none" and self.proxies is None:
-            self.proxies = Proxies(self.surfels, box=shading.box)
+            self.proxies = shading.proxies(self.surfels)
         if sampled:
             emitter = environment.environment.emitter()
         elif shading.specular != "none":
