@@ -107,10 +107,11 @@ def made(subject: Subject, look: Look, keys: list[Camera], frames: int) -> Gener
         files = []
         for k, camera in enumerate(smooth_path(keys, frames)):
             refined, view = Refined(_SIDE), replace(look, camera=camera, through=None)
+            view = replace(view, camera=seen(subject, view))
             while not refined.complete:
                 refined.add(subject, view)
                 yield (k + refined.passes / refined.total) / frames
-            picture = picture_of(subject, view, seen(subject, view), refined.means)
+            picture = picture_of(subject, view, view.camera, refined.means)
             files.append(Path(folder) / f"{k:03}.png")
             write_png(files[-1], to_8bit(picture))
         yield video.write(folder, files)[0].read_bytes()

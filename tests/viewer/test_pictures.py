@@ -28,10 +28,10 @@ CAMERA = orbit_camera(0.7, size=(56, 48))
 
 def seen(subject, look, most=passes.Refined().total):
     """The picture at rest after that many passes, display values."""
-    refined = passes.Refined()
+    refined, camera = passes.Refined(), window.seen(subject, look)
     for _ in range(most):
-        refined.add(subject, look)
-    return window.picture_of(subject, look, window.seen(subject, look), refined.means)
+        refined.add(subject, replace(look, camera=camera))
+    return window.picture_of(subject, look, camera, refined.means)
 
 
 # ---- Sizes ----
