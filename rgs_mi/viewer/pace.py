@@ -3,17 +3,11 @@
 import time
 from collections.abc import Callable
 
-GRIDS = (
-    128,
-    200,
-    288,
-    400,
-)  # points along both sides; the browser stretches them to its window, whose pixels are not square then
+#: Points along both sides. The browser stretches them to its window, whose pixels are not square then.
+GRIDS = (128, 200, 288, 400)
 RATE = 15  # frames a second
-_MARGIN, _HYSTERESIS = (
-    0.8,
-    0.85,
-)  # of a frame's time: what encoding and sending take, and what a larger grid has to keep clear of
+_MARGIN = 0.9  # of a frame's time: the rest is for sending it
+_HYSTERESIS = 0.92  # of that, for a larger grid than before
 _SMOOTHING = 0.7
 
 

@@ -77,9 +77,8 @@ class Refined:
     def _band(self, subject, look):
         """All samples of a band of pixels; the last one may reach below the picture, so that all are of one size."""
         fine, side = look.camera.subdivided(self.side**2)
-        rows = (
-            -(-fine.size[1] // (self.side**2 * TILE[1])) * TILE[1]
-        )  # whole tiles: their grid is that of all of the picture
+        bands = self.side**2
+        rows = -(-fine.size[1] // (bands * TILE[1])) * TILE[1]  # whole tiles, whose grid is that of all of the picture
         top = (self.passes - 1) * rows
         if top >= fine.size[1]:
             return

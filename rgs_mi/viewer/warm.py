@@ -6,15 +6,18 @@ import drjit as dr
 import numpy as np
 
 from ..core.camera import Camera
+from ..core.color import to_8bit
 from ..shading import deferred
 from .look import Look
 from .passes import measure
 from .subject import Subject
+from .window import picture_of
 
 
 def draw(subject: Subject, grid: int) -> None:
     """Draw a picture in motion of ``grid`` × ``grid`` points, as the first camera sees it."""
-    measure(subject, Look(subject.cameras[0]), subject.cameras[0].resized(grid, grid), settled=False)
+    look, camera = Look(subject.cameras[0]), subject.cameras[0].resized(grid, grid)
+    to_8bit(picture_of(subject, look, camera, measure(subject, look, camera, settled=False)))
 
 
 def warm(subject: Subject, grid: int) -> None:
