@@ -212,7 +212,7 @@ class Panel:
             jpeg_quality=picture.quality,
             depth=picture.depth,
         )
-        refined, (height, width) = self._window.refined, picture.pixels.shape[:2]
-        state = f"{width} × {height}" + ("" if self._window.moving else f", {100 * refined.passes // refined.total}%")
+        height, width = picture.pixels.shape[:2]
+        state = f"{width} × {height}" + ("" if picture.part is None else f", {100 * picture.part:.0f}%")
         if self._status.content != state:
             self._status.content = state

@@ -24,11 +24,12 @@ _FAR = 160.0  # world units: depth where nothing is
 @dataclass(frozen=True)
 class Picture:
     """What is sent: ``pixels`` [H, W, 3] uint8, as a JPEG of ``quality`` (None: without loss), and where objects stand among
-    the surfels their z ``depth`` [H, W], world units."""
+    the surfels their z ``depth`` [H, W], world units. ``part``: how far it is refined, None in motion."""
 
     pixels: np.ndarray
     quality: int | None
     depth: np.ndarray | None = None
+    part: float | None = None
 
 
 class Window:
@@ -108,8 +109,10 @@ class Window:
             return None
         if (self.refined.passes - 1) % _EVERY and not self.refined.complete:
             return None
-        pixels = to_8bit(picture_of(subject, look, look.camera, self.refined.means))
-        return Picture(pixels, None if self.refined.complete else _AT_REST, self._depth(self.refined.means))
+        refined = self.refined
+        pixels = to_8bit(picture_of(subject, look, look.camera, refined.means))
+        quality = None if refined.complete else _AT_REST
+        return Picture(pixels, quality, self._depth(refined.means), refined.passes / refined.total)
 
     def _depth(self, measured):
         if not self._overlays or "depth" not in measured:
