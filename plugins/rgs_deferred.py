@@ -82,7 +82,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from rgs_mi.core.camera import Camera, opaque, pixel_directions
+from rgs_mi.core.camera import Camera, pixel_directions
 from rgs_mi.core.errors import UserError
 from rgs_mi.shading import deferred, indirect
 from rgs_mi.shading.environment import Environment, FilteredEnvironment
@@ -204,9 +204,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         rays = pixel_directions(camera, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]))
         color, alpha = image.color, maps.alpha
         if not self.hide_emitters and environment is not None:
-            if self.turntable is not None:
-                environment = environment.turned(self.turntable.to_lamps(camera))
-            color, alpha = color + (1 - alpha) * environment.eval(rays, point=opaque(camera).origin), mi.Float(1)
+            color, alpha = color + (1 - alpha) * deferred.behind(camera, environment, self.turntable), mi.Float(1)
         values = [*color, *([alpha] if has_alpha else []), mi.Float(1)]
         for kind in self.aovs.values():
             values += _aov(kind, image, maps, camera, rays)

@@ -6,7 +6,7 @@ import sys
 
 from .core.errors import run_main
 from .core.runtime import CACHE_VARIABLE, cache_folder
-from .verbs import captures, exports, fits, renderings, suites
+from .verbs import captures, exports, fits, renderings, suites, windows
 from .verbs.arguments import Parser
 
 VERBS = {
@@ -17,6 +17,7 @@ VERBS = {
     "render": renderings.render,
     "render-dataset": renderings.render_dataset,
     "export": exports.export,
+    "view": windows.view,
     "ablate": suites.ablate,
     "benchmark": suites.benchmark,
     "crossvalidate": suites.crossvalidate,

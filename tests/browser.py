@@ -14,7 +14,8 @@ _OPTIONS = (
     "--disable-sync",
     "--no-first-run",
 )
-_NO_GPU, _WEBGL = ("--disable-gpu",), ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+_NO_GPU = ("--disable-gpu",)
+_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 
 
 @contextmanager

@@ -28,6 +28,8 @@ from ..priors.initialization import initial_points, surroundings
 from ..report import results
 from ..settings.config import to_dict
 from ..settings.settings import Settings
+from ..viewer import server
+from ..viewer.live import Watch
 
 _ON_SURFACE, _ANYWHERE = 0.7, 0.1  # opacities to start with; where surfels fill space, more would hide what is within
 _SMOOTHING = 0.95  # of the PSNR that the progress line shows
@@ -46,6 +48,7 @@ def optimize(
     resume: bool = False,
     quiet: bool = False,
     tensorboard: bool = False,
+    window: tuple[str, int] | None = None,
 ) -> Path:
     """Fit the scene at ``path`` and write the run's folder, which is returned.
 
@@ -55,9 +58,12 @@ def optimize(
       out:     the run's folder (default: runs/NAME)
       resume:  go on from the newest checkpoint in ``out``
       tensorboard: write event files into the folder's ``tensorboard``
+      window:  host and port of a page that shows the fit while it goes on (`viewer.live`)
 
     Raises: UserError for bad input, a package that is missing, a folder that can't be written, and a fit that diverges.
     """
+    if window:
+        server.check(*window)
     scene = FitScene.load(path, data, variables)
     overrides = [*overrides, *budget(minutes), *([f"seed={seed}"] if seed is not None else [])]
     settings = scene.settings(config, overrides)
@@ -69,15 +75,25 @@ def optimize(
     fit = _resume(saved, scene, dataset, settings) if saved else start(scene, dataset, settings, quiet)
     if not quiet:
         print(told(fit.settings, dataset))
+    watch = _watched(fit, folder, window)
     try:
-        stopped = _loop(fit, folder, quiet, events)
+        stopped = _loop(fit, folder, quiet, events, watch)
     finally:
-        if events:
-            events.close()
+        for opened in filter(None, (events, watch)):
+            opened.close()
     results.write(fit, scene, folder, quiet)
     if stopped:
         print(f"stopped at {100 * fit.progress:.0f}%; go on with the same command and --resume")
     return folder
+
+
+def _watched(fit, folder, window):
+    """The window on the fit, where someone asked for one. Raises: UserError where it can't be opened."""
+    if window is None:
+        return None
+    watch = Watch(fit, str(folder), *window)
+    print(watch.address, flush=True)
+    return watch
 
 
 def budget(minutes: float | None) -> list[str]:
@@ -219,9 +235,9 @@ def _flat(tree, prefix="") -> dict:
 # ---- Loop ----
 
 
-def _loop(fit, folder, quiet, events=None) -> bool:
-    """Step until the budget is spent or someone interrupts; returns whether someone did. Begins and ends with a
-    checkpoint: a folder that can't be written is known before the work, not after it."""
+def _loop(fit, folder, quiet, events=None, watch=None) -> bool:
+    """Step until the budget is spent or someone interrupts, also in a window (``watch``); returns whether someone did. Begins
+    and ends with a checkpoint: a folder that can't be written is known before the work, not after it."""
     settings, psnr = fit.settings, None
     checkpoint.save(folder, *_state(fit, folder))
     (folder / results.METRICS).unlink(missing_ok=True)  # from here on the run is unfinished
@@ -246,6 +262,9 @@ def _loop(fit, folder, quiet, events=None) -> bool:
                 except UserError as error:
                     warnings.warn(f"no checkpoint this time, the fit goes on: {error}", stacklevel=2)
                 saved = time.monotonic()
+            if watch:
+                watch.between(lambda: interrupt.requested)
+                interrupt.requested |= watch.stopped
         checkpoint.save(folder, *_state(fit, folder))
     return interrupt.requested
 

@@ -37,6 +37,17 @@ def to_8bit(image: np.ndarray) -> np.ndarray:
     return image if image.dtype == np.uint8 else (np.clip(np.nan_to_num(image), 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
+#: How radiance beyond white is shown: cut off, or Reinhard's x / (1 + x) (Reinhard et al. 2002, eq. 3), which has none.
+TONES = ("clip", "reinhard")
+
+
+def exposed(radiance: np.ndarray, stops: float = 0.0, tone: str = "clip") -> np.ndarray:
+    """Take linear radiance, of any shape, to display values in [0, 1]: exposed by ``stops``, then by one of `TONES`, then
+    sRGB."""
+    x = np.maximum(np.asarray(radiance) * np.float32(2.0**stops), 0)
+    return srgb_encode(x / (1 + x) if tone == "reinhard" else np.minimum(x, 1))
+
+
 def tone_map(radiance: np.ndarray) -> np.ndarray:
     """Take linear radiance, of any shape, to display values: Reinhard's curve (Reinhard et al. 2002, eq. 4), white at the
     99.5th percentile, then sRGB."""

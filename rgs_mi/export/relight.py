@@ -1,9 +1,8 @@
 """A loaded scene of surfels under another light, or of another material."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -16,10 +15,13 @@ from ..targets import environments
 MATERIAL = {"roughness": 1, "metallic": 1, "base_color": 3}
 
 
-def relight(scene: "mi.Scene", path: str | Path, envmap: str | Path | None = None, rotate: float = 0.0) -> None:
+def relight(
+    scene: "mi.Scene", path: str | Path, envmap: str | Path | None = None, rotate: float = 0.0, brighten: float = 0.0
+) -> None:
     """Put another ``envmap`` (an image, latitude-longitude, or the name of an environment of the suite; None: as it is) into
     the ``scene`` that was loaded from ``path``, in the place and orientation of its own, turned by ``rotate`` degrees about
-    its up axis. Another map stands still, where its own goes round with the camera, as on a turntable, and is at infinity.
+    its up axis, and brighter by ``brighten`` stops. Another map stands still, where its own goes round with the camera, as on
+    a turntable, and is at infinity.
 
     Raises: UserError for a scene without an environment map, and an image that can't be read.
     """
@@ -28,17 +30,29 @@ def relight(scene: "mi.Scene", path: str | Path, envmap: str | Path | None = Non
         raise UserError(f"{path}: has no 'envmap' to put another light in place of")
     params = mi.traverse(emitter)
     if envmap is not None:
-        params["data"] = mi.traverse(_load(envmap))["data"]
+        params["data"] = mi.traverse(load_envmap(envmap))["data"]
         params["scale"] = 1.0
         if is_deferred(integrator := scene.integrator()):
             integrator.turntable = integrator.room = None
-    turned = mi.ScalarTransform4f().rotate([0, 1, 0], rotate)  # an envmap's up axis is y
-    params["to_world"] = mi.Transform4f(mi.ScalarTransform4f(np.array(params["to_world"].matrix).reshape(4, 4)) @ turned)
+    if brighten:
+        params["scale"] = params["scale"] * 2.0**brighten
+    to_world = np.array(params["to_world"].matrix).reshape(4, 4)
+    to_world[:3, :3] = to_world[:3, :3] @ about_vertical(rotate)
+    params["to_world"] = mi.Transform4f(mi.ScalarTransform4f(to_world))
     params.update()
 
 
-def _load(envmap):
-    """An envmap emitter of an image, or of the suite."""
+def about_vertical(degrees: float) -> np.ndarray:
+    """Return the rotation [3, 3] by so many degrees about the up axis of an envmap, which is y, in its own frame."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+def load_envmap(envmap: str | Path) -> "mi.Emitter":
+    """Return the envmap emitter of an image, latitude-longitude, or of an environment of the suite, by its name.
+
+    Raises: UserError for an image that can't be read.
+    """
     if str(envmap) in environments.ENVIRONMENTS:
         return mi.load_dict({"type": "procedural_envmap", "name": str(envmap)})
     if not Path(envmap).is_file():
@@ -56,22 +70,49 @@ def _load(envmap):
 
 
 def edit(scene: "mi.Scene", path: str | Path, changes: Sequence[str]) -> None:
-    """Set materials of all surfels of the ``scene`` that was loaded from ``path``: ``changes`` are strings 'roughness=0.1',
-    'base_color=0.8,0.1,0.1', of `MATERIAL`.
+    """Set or scale materials of the surfels of the ``scene`` that was loaded from ``path``, by `edited`."""
+    params = mi.traverse(surfels_of(scene, path))
+    arrays = {name: params[name].numpy() for name in ("centers", *MATERIAL)}
+    for name, values in edited(arrays, changes).items():
+        params[name] = as_tensor(values)
+    params.update()
+
+
+def edited(arrays: Mapping[str, np.ndarray], changes: Iterable[str]) -> dict[str, np.ndarray]:
+    """Return those of the arrays [N, channels], by the names of `Surfels`, that ``changes`` give other values, one after
+    another: strings 'roughness=0.1', 'base_color=0.8,0.1,0.1', of `MATERIAL`; 'roughness*=0.5' scales what is there, and
+    'roughness*=0.5@X,Y,Z,R' does so within the radius R of a world-space point alone.
 
     Raises: UserError for another name, and numbers that are no material.
     """
-    params = mi.traverse(surfels_of(scene, path))
+    result = {}
     for change in changes:
-        name, _, text = change.partition("=")
-        if name not in MATERIAL:
-            raise UserError(f"--set {change}: unknown material '{name}': choose from {', '.join(MATERIAL)}")
-        try:
-            values = [float(v) for v in text.split(",")]
-        except ValueError as error:
-            raise UserError(f"--set {change}: expected {name}=NUMBER" + ",NUMBER,NUMBER" * (MATERIAL[name] == 3)) from error
-        if len(values) not in (1, MATERIAL[name]) or not all(0 <= v <= 1 for v in values):
-            raise UserError(f"--set {change}: needs {MATERIAL[name]} number(s) from 0 to 1")
-        count = dr.width(params[name].array) // MATERIAL[name]
-        params[name] = as_tensor(np.broadcast_to(np.array(values, np.float32), (count, MATERIAL[name])))
-    params.update()
+        name, scaled, values, ball = _parsed(change)
+        before = result.get(name, arrays[name])
+        after = np.clip(before * values, 0, 1) if scaled else np.broadcast_to(values, before.shape)
+        if ball is not None:
+            within = np.linalg.norm(arrays["centers"] - ball[:3], axis=1, keepdims=True) <= ball[3]
+            after = np.where(within, after, before)
+        result[name] = after.astype(np.float32)
+    return result
+
+
+def _parsed(change):
+    """(name, whether it scales, values [1 or channels], ball [4] or None) of a change. Raises: UserError for what is none."""
+    assigned, at, where = change.partition("@")
+    left, _, text = assigned.partition("=")
+    name, scaled = left.removesuffix("*"), left.endswith("*")
+    if name not in MATERIAL:
+        raise UserError(f"--set {change}: unknown material '{name}': choose from {', '.join(MATERIAL)}")
+    try:
+        values = np.array([float(v) for v in text.split(",")], np.float32)
+        ball = np.array([float(v) for v in where.split(",")]) if at else None
+    except ValueError as error:
+        form = f"{name}=NUMBER" + ",NUMBER,NUMBER" * (MATERIAL[name] == 3)
+        raise UserError(f"--set {change}: expected {form}, perhaps with * before = and @X,Y,Z,RADIUS at the end") from error
+    most = np.inf if scaled else 1
+    if len(values) not in (1, MATERIAL[name]) or not all(0 <= v <= most and np.isfinite(v) for v in values):
+        raise UserError(f"--set {change}: needs {MATERIAL[name]} number(s) from 0" + " to 1" * (not scaled))
+    if ball is not None and not (len(ball) == 4 and np.isfinite(ball).all() and ball[3] > 0):
+        raise UserError(f"--set {change}: '{where}' is no ball: needs X,Y,Z,RADIUS")
+    return name, scaled, values, ball

@@ -11,7 +11,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from ..core.camera import Camera, focus_point
-from ..core.color import srgb_encode
+from ..core.color import TONES, exposed
 from ..core.errors import UserError
 from ..core.files import write_exr, write_png
 from ..core.progress import Progress
@@ -32,16 +32,21 @@ def render_scene(
     *,
     variables: Mapping[str, object] | None = None,
     view: str | None = None,
+    poses: Sequence[str] = (),
     turntable: int | None = None,
     along: int | None = None,
     filmed: bool = False,
-    size: int | None = None,
+    size: int | tuple[int, int] | None = None,
     spp: int | None = None,
     out: str | Path | None = None,
     aovs: bool = False,
     envmap: str | Path | None = None,
     rotate: float = 0.0,
+    brighten: float = 0.0,
     changes: Sequence[str] = (),
+    background: bool | None = None,
+    exposure: float = 0.0,
+    tone: str = "clip",
     quiet: bool = False,
 ) -> list[Path]:
     """Render a scene of surfels into PNGs with straight alpha, and return their paths.
@@ -50,17 +55,21 @@ def render_scene(
       path:      a run's folder, or a scene file
       variables: of the scene, to override its defaults
       view:      a sensor, by its id or index (default: the first)
+      poses:     instead of a view, cameras as `posed` reads them; with ``along`` the path goes through them
       turntable: instead of a view, that many frames of a camera that circles the object about the environment's
                  up axis, at the sensors' mean distance and elevation
       along:     instead of a view, that many frames of a camera that moves from sensor to sensor in their order, which for
                  a run is that of its test views (0: the sensors themselves)
       filmed:    whether to write the frames as a video and a contact sheet, too (`video.write`)
-      size:      width in pixels (default: the sensor's); the height follows
+      size:      width in pixels, of which the height follows, or both (default: the sensor's)
       spp:       samples per pixel; a square number for 'rgs_deferred' (default: what the first sensor says)
       out:       a folder, or a PNG for a single view (default: ``renders``, ``turntable`` or ``path`` beside the scene)
       aovs:      whether to write ``NAME.exr`` as well: radiance, alpha and the G-buffer, float32
-      envmap, rotate: another environment map, and the degrees by which light is turned (`relight`)
-      changes:   materials to set (`relight.edit`)
+      envmap, rotate, brighten: another environment map, the degrees by which light is turned, and the stops by which it is
+                 brighter (`relight`)
+      changes:   materials to set or scale (`relight.edit`)
+      background: whether pixels show the environment behind the object (default: as the scene says)
+      exposure, tone: of the PNGs, `core.color.exposed`
 
     Raises: UserError for bad input and where a file can't be written.
     """
@@ -77,8 +86,12 @@ def render_scene(
     scene = load_scene(path, variables or {})
     if not scene.sensors():
         raise UserError(f"{path}: has no sensors: nothing says where to look from")
-    if envmap is not None or rotate:
-        relight(scene, path, envmap, rotate)
+    if tone not in TONES:
+        raise UserError(f"--tone {tone}: choose one of {', '.join(TONES)}")
+    if background is not None and is_deferred(scene.integrator()):
+        scene.integrator().hide_emitters = not background
+    if envmap is not None or rotate or brighten:
+        relight(scene, path, envmap, rotate, brighten)
         if getattr(scene.integrator(), "diffuse", "lit") != "lit":
             print(
                 f"{path}: its diffuse radiance stays as photographed, only reflections change: "
@@ -87,9 +100,7 @@ def render_scene(
             )
     if changes:
         edit(scene, path, changes)
-    cameras = (
-        _circle(scene, path, turntable) if turntable else _along(scene, path, along) if moves else _view(scene, path, view)
-    )
+    cameras = _cameras(scene, path, view, poses, turntable, along, size)
     out = Path(out) if out else path.parent / ("turntable" if turntable else "path" if moves else "renders")
     integrator = with_aovs(scene, path) if aovs else scene.integrator()
     spp = spp or spp_of(scene)
@@ -97,11 +108,10 @@ def render_scene(
     with Progress(None, quiet or len(cameras) == 1 and spp <= _PASS, "rendering") as progress:
         for k, (name, camera) in enumerate(cameras.items()):
             step = lambda part: progress.update((k + part) / len(cameras))
-            if size:
-                camera = camera.resized(size, max(1, round(size * camera.size[1] / camera.size[0])))
+            camera = camera.resized(*_size(size, camera.size))
             file = out if out.suffix == ".png" and not moves else out / f"{name}.png"
             image = _render(scene, mi.load_dict(sensor_dict(camera)), integrator, spp, step)
-            write_png(file, straight(image))
+            write_png(file, straight(image, exposure, tone))
             if aovs:
                 write_exr(file.with_suffix(".exr"), image, ["R", "G", "B", "A", *integrator.aov_names()])
             written.append(file)
@@ -119,10 +129,11 @@ def _render(scene, sensor, integrator, spp, progress):
     return np.asarray(image)
 
 
-def straight(image: np.ndarray) -> np.ndarray:
-    """Take a rendering, linear and premultiplied [H, W, 4 or more], to display values with straight alpha [H, W, 4]."""
+def straight(image: np.ndarray, stops: float = 0.0, tone: str = "clip") -> np.ndarray:
+    """Take a rendering, linear and premultiplied [H, W, 4 or more], to display values with straight alpha [H, W, 4], `exposed`
+    by ``stops`` and ``tone``."""
     alpha = np.clip(image[..., 3:4], 0, 1)
-    return np.concatenate([srgb_encode(np.clip(image[..., :3] / np.maximum(alpha, 1e-6), 0, 1)), alpha], -1)
+    return np.concatenate([exposed(image[..., :3] / np.maximum(alpha, 1e-6), stops, tone), alpha], -1)
 
 
 def sensor_dict(camera: Camera) -> dict:
@@ -130,6 +141,51 @@ def sensor_dict(camera: Camera) -> dict:
     sensor = camera.to_sensor_dict()
     sensor["film"]["pixel_format"] = "rgba"
     return sensor
+
+
+def _size(size, own):
+    """Width and height of a picture, of what was asked for and a camera's ``own``."""
+    if not size:
+        return own
+    return size if isinstance(size, tuple) else (size, max(1, round(size * own[1] / own[0])))
+
+
+def posed(text: str, size: tuple[int, int]) -> Camera:
+    """Return the camera of ``size`` (width, height) that ten numbers with commas stand for: its position, a point that it looks
+    at, an up direction, x, y, z each, world space, and its horizontal field of view in degrees. `pose` is the inverse.
+
+    Raises: UserError where they stand for none.
+    """
+    try:
+        numbers = np.array([float(v) for v in text.split(",")])
+    except ValueError:
+        numbers = np.zeros(0)
+    if len(numbers) == 10 and np.isfinite(numbers).all() and 0 < numbers[9] < 180:
+        origin, target, up = numbers[:9].reshape(3, 3)
+        if np.linalg.norm(np.cross(target - origin, up)) > 1e-9:
+            return Camera.look_at(origin, target, up, numbers[9], size)
+    raise UserError(
+        f"--camera {text}: needs ten numbers X,Y,Z,X,Y,Z,X,Y,Z,DEG: where it is, what it looks at, up, and its field of view"
+    )
+
+
+def pose(camera: Camera, distance: float = 1.0) -> str:
+    """Return the ten numbers of which `posed` makes a ``camera`` of square pixels, whose principal point is its center; it
+    looks at the point at that ``distance``."""
+    x, y, z = camera.to_world[:3, :3].T
+    fov = np.degrees(2 * np.arctan(0.5 * camera.size[0] / camera.focal[0]))
+    return ",".join(f"{v:.9g}" for v in (*camera.origin, *(camera.origin + distance * z), *-y, fov))
+
+
+def _cameras(scene, path, view, poses, turntable, along, size):
+    """{name: camera} of the pictures that were asked for."""
+    if poses and (view is not None or turntable):
+        raise UserError("--camera: has a place of its own: leave out --view and --turntable")
+    given = [posed(text, _size(size, Camera.from_sensor(scene.sensors()[0]).size)) for text in poses]
+    named = {f"camera_{k}": camera for k, camera in enumerate(given)}
+    if turntable:
+        return _circle(scene, path, turntable)
+    return (named or _view(scene, path, view)) if along is None else _along(scene, path, along, named)
 
 
 def _view(scene, path, view):
@@ -164,16 +220,22 @@ def _circle(scene, path, frames):
     return circle
 
 
-def _along(scene, path, frames):
-    """{sensor's id: camera} of all sensors, or {'000': camera, …} on a smooth path through them, about the point that they
-    look at; of one size."""
-    cameras = [Camera.from_sensor(sensor) for sensor in scene.sensors()]
-    size = cameras[0].size
-    cameras = [camera.resized(*size) for camera in cameras]
+def _along(scene, path, frames, given=None):
+    """{name: camera} of the cameras ``given`` (default: all sensors), or {'000': camera, …} on a smooth path through them."""
+    cameras = given or {sensor.id(): Camera.from_sensor(sensor) for sensor in scene.sensors()}
+    size = next(iter(cameras.values())).size
+    cameras = {name: camera.resized(*size) for name, camera in cameras.items()}
     if not frames:
-        return dict(zip([sensor.id() for sensor in scene.sensors()], cameras))
+        return cameras
     if len(cameras) < 2:
         raise UserError(f"{path}: has one sensor, which is no path: use --turntable")
+    return {f"{k:03}": camera for k, camera in enumerate(smooth_path([*cameras.values()], frames))}
+
+
+def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
+    """Return ``frames`` cameras on a smooth path through two ``cameras`` or more, of one size, about the point that they look
+    at."""
+    size = cameras[0].size
     center, _ = focus_point(cameras)
     knots, times = np.arange(len(cameras)), np.linspace(0, len(cameras) - 1, frames)
     through = lambda values: PchipInterpolator(knots, values)(times)
@@ -182,7 +244,7 @@ def _along(scene, path, frames):
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = rotations, center - np.einsum("kij,kj->ki", rotations, seen)
     focal, principal = (through([getattr(c, name) for c in cameras]) for name in ("focal", "principal"))
-    return {f"{k:03}": Camera(poses[k], tuple(focal[k]), tuple(principal[k]), size) for k in range(frames)}
+    return [Camera(poses[k], tuple(focal[k]), tuple(principal[k]), size) for k in range(frames)]
 
 
 def with_aovs(scene: "mi.Scene", path: str | Path) -> "mi.Integrator":

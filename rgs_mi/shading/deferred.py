@@ -7,9 +7,11 @@ import mitsuba as mi
 
 from ..core.bounding_box import BoundingBox
 from ..core.camera import Camera, opaque, pixel_directions
+from ..core.turntable import Turntable
 from ..splat.gbuffer import GBuffer, render_gbuffer
 from ..splat.tiles import Cutoffs
 from ..surfels.surfels import Surfels
+from .environment import FilteredEnvironment
 from .lighting import Lighting
 from .surface import Surface
 
@@ -44,6 +46,15 @@ def within(gbuffer: GBuffer, camera: Camera, box: BoundingBox | None) -> "mi.Boo
         return covered
     directions = pixel_directions(camera, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]))
     return covered & box.contains(_points(camera, directions, depth / dr.maximum(alpha, COVERED)))
+
+
+def behind(camera: Camera, environment: FilteredEnvironment, turntable: Turntable | None) -> "mi.Color3f":
+    """Return the radiance of the ``environment`` that each pixel of ``camera`` looks at, of width W · H; with the light that
+    goes round a ``turntable`` where there is one."""
+    if turntable is not None:
+        environment = environment.turned(turntable.to_lamps(camera))
+    rays = pixel_directions(camera, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]))
+    return environment.eval(rays, point=opaque(camera).origin)
 
 
 def _points(camera, direction, depth):

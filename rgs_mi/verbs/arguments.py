@@ -61,6 +61,14 @@ def add_out(parser: argparse.ArgumentParser, default: str, text: str) -> None:
     parser.add_argument("--out", type=Path, default=Path(default), metavar="DIR", help=f"{text} (default: %(default)s)")
 
 
+def add_address(parser: argparse.ArgumentParser) -> None:
+    """Add --host and --port, where a window's page is."""
+    parser.add_argument(
+        "--host", default="localhost", help="address to listen at; 0.0.0.0 lets other machines in (default: %(default)s)"
+    )
+    add_integer(parser, "--port", 8080, "of the page, 0 for any that is free")
+
+
 def add_variables(parser: argparse.ArgumentParser) -> None:
     """Add -D, the variables of a scene, as `parse_variables` reads them."""
     parser.add_argument(

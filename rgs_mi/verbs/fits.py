@@ -6,7 +6,18 @@ from pathlib import Path
 from ..core.errors import parse_variables
 from ..core.runtime import set_variant
 from ..core.scene_files import find_scene
-from .arguments import Parser, Run, add_budget, add_common, add_integer, add_names, add_variables, check_settings, known
+from .arguments import (
+    Parser,
+    Run,
+    add_address,
+    add_budget,
+    add_common,
+    add_integer,
+    add_names,
+    add_variables,
+    check_settings,
+    known,
+)
 
 
 def optimize(parser: Parser) -> Run:
@@ -24,6 +35,8 @@ def optimize(parser: Parser) -> Run:
     parser.add_argument("--resume", action="store_true", help="go on from the run's newest checkpoint")
     parser.add_argument("--seed", type=int, help="of everything random")
     parser.add_argument("--tensorboard", action="store_true", help="write event files into the run's folder tensorboard/")
+    parser.add_argument("--view", action="store_true", help="show the fit in a window, a page that a browser opens")
+    add_address(parser)
     add_common(parser)
 
     def run(args):
@@ -44,6 +57,7 @@ def optimize(parser: Parser) -> Run:
             resume=args.resume,
             quiet=args.quiet,
             tensorboard=args.tensorboard,
+            window=(args.host, args.port) if args.view else None,
         )
 
     return run

@@ -1,7 +1,9 @@
 """The verbs that render: render, render-dataset."""
 
+import argparse
 from pathlib import Path
 
+from ..core.color import TONES
 from ..core.errors import parse_variables
 from ..core.runtime import CACHE_VARIABLE, cache_folder, set_variant
 from ..core.scene_files import find_scene
@@ -29,7 +31,18 @@ def render(parser: Parser) -> Run:
         action="store_true",
         help="make the frames a video, too, and a contact sheet; needs `pip install imageio-ffmpeg`",
     )
-    parser.add_argument("--size", type=int, metavar="W", help="width in pixels (default: the sensor's)")
+    parser.add_argument(
+        "--camera",
+        dest="poses",
+        action="append",
+        default=[],
+        metavar="POSE",
+        help="instead of a view, a camera as the window's 'command' writes it: --camera=X,Y,Z,X,Y,Z,X,Y,Z,DEG, where it is, "
+        "what it looks at, up, horizontal field of view; again for more, which --path goes through",
+    )
+    parser.add_argument(
+        "--size", type=_size, metavar="W|WxH", help="width in pixels, or width and height (default: the sensor's)"
+    )
     parser.add_argument(
         "--spp", type=int, help="samples per pixel; for surfels alone a square number (default: as the scene says)"
     )
@@ -41,14 +54,23 @@ def render(parser: Parser) -> Run:
         help="light it by this image, latitude-longitude EXR or HDR, or by an environment of the suite, e.g. kitchen",
     )
     parser.add_argument("--rotate", type=float, default=0.0, metavar="DEG", help="turn the light about the vertical")
+    parser.add_argument("--brighten", type=float, default=0.0, metavar="STOPS", help="make the light brighter")
     parser.add_argument(
         "--set",
         dest="changes",
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="the material of all surfels: roughness, metallic or base_color",
+        help="the material of all surfels: roughness, metallic or base_color; NAME*=FACTOR scales it, and @X,Y,Z,RADIUS at the "
+        "end keeps to a ball",
     )
+    parser.add_argument(
+        "--background",
+        action=argparse.BooleanOptionalAction,
+        help="show the light behind the object (default: as the scene says)",
+    )
+    parser.add_argument("--exposure", type=float, default=0.0, metavar="STOPS", help="of the pictures, not of the EXRs")
+    parser.add_argument("--tone", default="clip", choices=TONES, help="what lies beyond white (default: %(default)s)")
     add_common(parser)
 
     def run(args):
@@ -60,6 +82,7 @@ def render(parser: Parser) -> Run:
             scene,
             variables=parse_variables(args.define),
             view=args.view,
+            poses=args.poses,
             turntable=args.turntable,
             along=args.path,
             filmed=args.video,
@@ -69,12 +92,22 @@ def render(parser: Parser) -> Run:
             aovs=args.aovs,
             envmap=args.envmap,
             rotate=args.rotate,
+            brighten=args.brighten,
             changes=args.changes,
+            background=args.background,
+            exposure=args.exposure,
+            tone=args.tone,
             quiet=args.quiet,
         ):
             print(path)
 
     return run
+
+
+def _size(text):
+    """A width, or (width, height)."""
+    width, times, height = text.partition("x")
+    return (int(width), int(height)) if times else int(width)
 
 
 def render_dataset(parser: Parser) -> Run:

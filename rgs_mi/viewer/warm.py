@@ -1,0 +1,50 @@
+"""All kernels that pictures of one size may need, compiled beforehand."""
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+
+from ..core.camera import Camera
+from ..core.color import to_8bit
+from ..shading import deferred
+from .look import Look
+from .passes import measure
+from .subject import Subject
+from .window import picture_of
+
+
+def draw(subject: Subject, grid: int) -> None:
+    """Draw a picture in motion of ``grid`` × ``grid`` points, as the first camera sees it."""
+    look, camera = Look(subject.cameras[0]), subject.cameras[0].resized(grid, grid)
+    to_8bit(picture_of(subject, look, camera, measure(subject, look, camera, settled=False)))
+
+
+def warm(subject: Subject, grid: int) -> None:
+    """Compile what pictures of ``grid`` × ``grid`` points need, whatever they show: from two places, for what is the same in
+    both is compiled in; with the light behind the object; where no reflected ray meets it; and where it is not seen at all."""
+    first, last = subject.cameras[0], subject.cameras[-1]
+    for camera in (first, _behind(subject, first), last, _turned_away(first)):
+        for background in ("white", "light"):
+            measure(subject, Look(camera, background=background), camera.resized(grid, grid), settled=False)
+    lit = subject.lit(Look(first), settled=False)
+    if lit.lighting is not None and lit.lighting.indirect is not None:
+        alone = replace(lit.lighting, indirect=replace(lit.lighting.indirect, kind="visibility"))
+        with dr.suspend_grad():
+            image = deferred.render(lit.surfels, first.resized(grid, grid), alone)
+            dr.eval(image.color, image.diffuse, image.specular)
+
+
+def _behind(subject, camera):
+    """The camera that looks from the other side, from farther away."""
+    to_world = np.diag([-1.0, -1.0, 1.0, 1.0])
+    around = np.eye(4)
+    around[:3, 3] = subject.center
+    pose = around @ to_world @ np.linalg.inv(around) @ camera.to_world
+    pose[:3, 3] += 0.5 * (pose[:3, 3] - subject.center)
+    return replace(camera, to_world=pose)
+
+
+def _turned_away(camera: Camera) -> Camera:
+    """The camera that looks the other way."""
+    return replace(camera, to_world=camera.to_world @ np.diag([-1.0, 1.0, -1.0, 1.0]))
