@@ -13,7 +13,7 @@ import numpy as np
 from ..core.errors import UserError
 from .frusta import Frusta
 from .look import Look, window_camera
-from .pace import Pace
+from .pace import GRIDS, Pace
 from .panel import Panel
 from .subject import Subject
 from .warm import draw, warm
@@ -71,7 +71,7 @@ class Server:
     # ---- Windows come and go ----
 
     def _start_at(self, camera):
-        first, distance = self._page.initial_camera, np.linalg.norm(camera.origin - self.subject.center)
+        first, distance = self._page.initial_camera, float(np.linalg.norm(camera.origin - self.subject.center))
         first.up, first.fov = self.subject.up, 2 * np.arctan(0.5 * camera.size[1] / camera.focal[1])
         first.position, first.look_at = camera.origin, camera.origin + distance * camera.to_world[:3, 2]
         first.near, first.far = 1e-3 * distance, 1e3 * distance
@@ -115,7 +115,7 @@ class Server:
             self._jobs.popleft()()
             return True
         if not self.pace.seconds:
-            self._warm()
+            self._warm(GRIDS[0])
             return True
         for number in list(self._turns):
             window = self.windows.get(number)
@@ -129,7 +129,7 @@ class Server:
             self._later.popleft()()
             return True
         if idle and self.pace.cold is not None:
-            self._warm()
+            self._warm(self.pace.cold)
             return True
         return False
 
@@ -148,9 +148,9 @@ class Server:
         if picture is not None and panel is not None:
             panel.show(picture)
 
-    def _warm(self):
-        """Compile what the smallest grid needs that is not warm yet."""
-        self.pace.warm(self.pace.cold, lambda grid: warm(self.subject, grid), lambda grid: draw(self.subject, grid))
+    def _warm(self, grid):
+        """Compile what a grid needs, and measure it."""
+        self.pace.warm(grid, lambda grid: warm(self.subject, grid), lambda grid: draw(self.subject, grid))
 
 
 def _camera(client):
@@ -199,5 +199,6 @@ def check(host: str, port: int) -> None:
         raise _taken(port, error.strerror) from error
 
 
-def _taken(port, reason="Address already in use"):
+def _taken(port, reason=None):
+    reason = reason or "Address already in use"
     return UserError(f"--port {port}: can't be opened ({reason}): choose another, or 0 for any that is free")
