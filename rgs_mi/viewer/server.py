@@ -6,14 +6,14 @@ import socket
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..core.errors import UserError
 from .frusta import Frusta
 from .look import Look, window_camera
-from .pace import Pace
+from .pace import GRIDS, Pace
 from .panel import Panel
 from .subject import Subject
 from .warm import draw, warm
@@ -71,8 +71,7 @@ class Server:
     # ---- Windows come and go ----
 
     def _start_at(self, camera):
-        first: Any = self._page.initial_camera
-        distance = np.linalg.norm(camera.origin - self.subject.center)
+        first, distance = self._page.initial_camera, float(np.linalg.norm(camera.origin - self.subject.center))
         first.up, first.fov = self.subject.up, 2 * np.arctan(0.5 * camera.size[1] / camera.focal[1])
         first.position, first.look_at = camera.origin, camera.origin + distance * camera.to_world[:3, 2]
         first.near, first.far = 1e-3 * distance, 1e3 * distance
@@ -116,7 +115,7 @@ class Server:
             self._jobs.popleft()()
             return True
         if not self.pace.seconds:
-            self._warm()
+            self._warm(GRIDS[0])
             return True
         for number in list(self._turns):
             window = self.windows.get(number)
@@ -130,7 +129,7 @@ class Server:
             self._later.popleft()()
             return True
         if idle and self.pace.cold is not None:
-            self._warm()
+            self._warm(self.pace.cold)
             return True
         return False
 
@@ -149,11 +148,9 @@ class Server:
         if picture is not None and panel is not None:
             panel.show(picture)
 
-    def _warm(self):
-        """Compile what the smallest grid needs that is not warm yet."""
-        cold = self.pace.cold
-        assert cold is not None, "`turn` asks first"
-        self.pace.warm(cold, lambda grid: warm(self.subject, grid), lambda grid: draw(self.subject, grid))
+    def _warm(self, grid):
+        """Compile what a grid needs, and measure it."""
+        self.pace.warm(grid, lambda grid: warm(self.subject, grid), lambda grid: draw(self.subject, grid))
 
 
 def _camera(client):
@@ -199,8 +196,9 @@ def check(host: str, port: int) -> None:
     except socket.gaierror as error:
         raise UserError(f"--host {host}: no address of this machine ({error.strerror})") from error
     except OSError as error:
-        raise _taken(port, error.strerror or str(error)) from error
+        raise _taken(port, error.strerror) from error
 
 
-def _taken(port, reason="Address already in use"):
+def _taken(port, reason=None):
+    reason = reason or "Address already in use"
     return UserError(f"--port {port}: can't be opened ({reason}): choose another, or 0 for any that is free")

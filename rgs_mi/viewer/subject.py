@@ -80,9 +80,9 @@ class Subject:
         if deferred := is_deferred(integrator):
             shading, shader = integrator.shading(eta), integrator.shader
         else:
-            lit: Any = getattr(integrator, "diffuse", "radiance") if emitter else "radiance"
-            box = getattr(integrator, "box", None)
-            shading, shader = Shading("split_sum" if emitter else "none", lit, eta=eta, box=box), None
+            lit = emitter is not None and getattr(integrator, "diffuse", "radiance") == "lit"
+            diffuse, box = "lit" if lit else "radiance", getattr(integrator, "box", None)
+            shading, shader = Shading("split_sum" if emitter else "none", diffuse, eta=eta, box=box), None
         lights = None
         if emitter and shading.specular != "none":
             own = replace(Environment.from_emitter(emitter), room=getattr(integrator, "room", None))
