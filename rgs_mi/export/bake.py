@@ -4,7 +4,7 @@ A viewer knows no light. So each surfel is shaded, by the scene's own `Lighting`
 the sphere, seen from all of those in front of it, and its clipped display colours c_k are fitted by spherical harmonics of third
 degree (`splats.py`), in weighted and regularised least squares:
 
-    min Σ_k w_k |½ + Σ_j sh_j Y_j(−ω_k) − c_k|² / Σ_k w_k + λ Σ_{j>0} |sh_j|²                        (15)
+    min Σ_k w_k |½ + Σ_j h_j Y_j(−ω_k) − c_k|² / Σ_k w_k + λ Σ_{j>0} |h_j|²                        (15)
 
 w_k is the area that the surfel shows, times how densely cameras look from there, times next to nothing where other surfels hide
 it. So (15) is the error of pictures, but for how surfels blend. The penalty keeps coefficients small, also where nobody looks

@@ -37,9 +37,9 @@ def write(folder: str | Path, splats: Splats) -> list[Path]:
 
 def _attributes(splats):
     """{semantic: [N] or [N, 3 or 4] little-endian floats}."""
-    mean = np.clip(0.5 + sh_basis(np.array([[0.0, 0.0, 1.0]]))[0, 0] * splats.sh[:, 0], 0, 1)
+    mean = np.clip(0.5 + sh_basis(np.array([[0.0, 0.0, 1.0]]))[0, 0] * splats.harmonics[:, 0], 0, 1)
     harmonics = {
-        f"SH_DEGREE_{degree}_COEF_{order}": splats.sh[:, degree**2 + order]
+        f"SH_DEGREE_{degree}_COEF_{order}": splats.harmonics[:, degree**2 + order]
         for degree in range(DEGREE + 1)
         for order in range(2 * degree + 1)
     }

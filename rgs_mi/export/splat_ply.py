@@ -15,7 +15,9 @@ def write(folder: str | Path, splats: Splats) -> list[Path]:
     Raises: UserError where the disk is full or the folder can't be written.
     """
     fields = {name: getattr(splats, name) for name in ("centers", "rotations", "scales")}
-    columns = core_columns({**fields, "opacities": splats.opacities[:, None], "sh": splats.sh.reshape(len(splats), -1)})
+    columns = core_columns(
+        {**fields, "opacities": splats.opacities[:, None], "sh": splats.harmonics.reshape(len(splats), -1)}
+    )
     path = Path(folder) / NAME
     write_columns(path, columns, ["SplatRenderMode: 2dgs"])
     return [path]

@@ -1,7 +1,7 @@
 """Gaussians as splat viewers hold them: display colours in spherical harmonics, nothing to be lit.
 
 The real spherical harmonics Y_k are those of 3DGS, with the Condon–Shortley phase, k = l² + l + m: a splat seen along the unit
-direction d, from the camera to its center, has the colour ½ + Σ_k sh_k Y_k(d), which viewers clip to [0, 1].
+direction d, from the camera to its center, has the colour ½ + Σ_k h_k Y_k(d), which viewers clip to [0, 1].
 """
 
 from dataclasses import dataclass, replace
@@ -25,14 +25,14 @@ class Splats:
     rotations  [N, 4], unit quaternions (x, y, z, w), whose third axis is the normal
     scales     [N, 2], standard deviations along the first two axes
     opacities  [N], in (0, 1)
-    sh         [N, 16, 3], of display sRGB, as the module says
+    harmonics  [N, 16, 3], the h_k of the module, of display sRGB
     """
 
     centers: np.ndarray
     rotations: np.ndarray
     scales: np.ndarray
     opacities: np.ndarray
-    sh: np.ndarray
+    harmonics: np.ndarray
 
     def __len__(self) -> int:
         return len(self.centers)
@@ -44,7 +44,7 @@ class Splats:
 
     def colors(self, direction: np.ndarray) -> np.ndarray:
         """Return the display colours [N, 3], not clipped, that are seen along one unit ``direction`` [3]."""
-        return 0.5 + np.einsum("k,nkc->nc", sh_basis(direction[None])[0], self.sh)
+        return 0.5 + np.einsum("k,nkc->nc", sh_basis(direction[None])[0], self.harmonics)
 
     def rotated(self, rotation: np.ndarray) -> "Splats":
         """Return the same splats in a world that ``rotation`` [3, 3] takes this one to."""
@@ -54,7 +54,7 @@ class Splats:
             self,
             centers=as_float(turn.apply(self.centers)),
             rotations=as_float((turn * Rotation.from_quat(self.rotations)).as_quat()),
-            sh=as_float(np.einsum("jk,nkc->njc", sh_rotation(rotation), self.sh)),
+            harmonics=as_float(np.einsum("jk,nkc->njc", sh_rotation(rotation), self.harmonics)),
         )
 
 

@@ -87,7 +87,7 @@ def _field(stage, name, splats, kernel):
     scale.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(splats.thick_scales))
     opacity.CreateOpacitiesAttr(Vt.FloatArray.FromNumpy(splats.opacities))
     radiance.CreateRadianceSphericalHarmonicsDegreeAttr(DEGREE)
-    radiance.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(splats.sh.reshape(-1, 3)))
+    radiance.CreateRadianceSphericalHarmonicsCoefficientsAttr(Vt.Vec3fArray.FromNumpy(splats.harmonics.reshape(-1, 3)))
     reach = _EXTENT * splats.scales.max(1, keepdims=True)
     extent = np.stack([(splats.centers - reach).min(0), (splats.centers + reach).max(0)])
     UsdGeom.Boundable(field.GetPrim()).CreateExtentAttr(Vt.Vec3fArray.FromNumpy(np.float32(extent)))

@@ -140,7 +140,10 @@ def test_surroundings_reflect_nothing():
     alone = bake(scene_of(surfels, specular="none"), "scene.xml", quiet=True)
     beyond = splats.centers[:, 0] > 5
     assert beyond.sum() == 1
-    assert np.allclose(splats.sh[beyond], alone.sh[beyond]) and abs(splats.sh[~beyond] - alone.sh[~beyond]).max() > 0.05
+    assert (
+        np.allclose(splats.harmonics[beyond], alone.harmonics[beyond])
+        and abs(splats.harmonics[~beyond] - alone.harmonics[~beyond]).max() > 0.05
+    )
 
 
 def test_turntable_says_at_which_azimuth(capsys):
