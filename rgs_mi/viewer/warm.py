@@ -22,7 +22,10 @@ def draw(subject: Subject, grid: int) -> None:
 
 def warm(subject: Subject, grid: int) -> None:
     """Compile what pictures of ``grid`` × ``grid`` points need, whatever they show: from two places, for what is the same in
-    both is compiled in; with the light behind the object; where no reflected ray meets it; and where it is not seen at all."""
+    both is compiled in; with the light behind the object; where no reflected ray meets it; and where it is not seen at all.
+    Of a fit in progress, which changes what it needs, one picture."""
+    if subject.changing:
+        return draw(subject, grid)
     first, last = subject.cameras[0], subject.cameras[-1]
     for camera in (first, _behind(subject, first), last, _turned_away(first)):
         for background in ("white", "light"):
