@@ -42,8 +42,8 @@ what a principled BSDF with the G-buffer's material reflects of the environment 
  * - room
    - |string|
    - A room on whose walls the environment is painted: nine numbers, x, y, z of its center in world space, from which the map is
-     seen, and the distances to the walls -x, +x, -y, +y, -z, +z of the environment's frame, ``inf`` where there is none
-     (Default: none, the environment is at infinity)
+     seen (on a turntable a point on its axis), and the distances to the walls -x, +x, -y, +y, -z, +z of the environment's
+     frame, ``inf`` where there is none (Default: none, the environment is at infinity)
 
  * - shader
    - |string|

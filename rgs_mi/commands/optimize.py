@@ -142,6 +142,8 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
 
     def fit_of(shown, settings):
         positions, normals, colors, spacing = points
+        shading = _shading(scene, settings, dataset)
+        center = shading.turntable.point if shading.turntable else middle  # a room turns about its center
         model = Model.start(
             positions,
             normals,
@@ -156,9 +158,9 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
             begin.roughness,
             settings.shader,
             two_sided=None if box is None else True,
-            room=(middle, settings.room * extent) if settings.room else None,
+            room=(center, settings.room * extent) if settings.room else None,
         )
-        return Fit(shown, model, settings, extent, _shading(scene, settings, dataset), _priors(shown, settings))
+        return Fit(shown, model, settings, extent, shading, _priors(shown, settings))
 
     if settings.light == "auto":
         settings = light.tried(fit_of, dataset, settings, quiet)

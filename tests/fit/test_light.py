@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from rgs_mi.commands.optimize import optimize
+from rgs_mi.commands.optimize import optimize, start
 from rgs_mi.core.camera import Camera
 from rgs_mi.core.errors import UserError
 from rgs_mi.core.files import write_json
@@ -22,6 +22,7 @@ from rgs_mi.datasets.types import Dataset, View
 from rgs_mi.export.relight import relight
 from rgs_mi.export.render import straight
 from rgs_mi.fit import light, losses
+from rgs_mi.fit.scene import FitScene
 from rgs_mi.fit.trainer import Fit
 from rgs_mi.settings.settings import Settings, Stage
 from rgs_mi.shading import deferred
@@ -176,6 +177,14 @@ def test_a_run_in_a_room(tmp_path):
     assert all(abs(later[side] / walls[side] - 1) < 0.05 for side in walls)
     relight(first, run / "scene.xml", envmap="studio")
     assert first.integrator().room is None
+
+
+def test_a_room_turns_about_its_center(tmp_path):
+    fitted = FitScene.load(find_scene("object", "scenes"), written(tmp_path / "ball"))
+    overrides = ["light=turntable", "turns=[0,0]", "room=3", "initialization.surfels=400", "initialization.compare=false"]
+    fit = start(fitted, fitted.dataset(quiet=True), fitted.settings(overrides=overrides))
+    table = fit.shading.turntable
+    assert table is not None and fit.model.center == pytest.approx(table.point, abs=1e-6)
 
 
 def test_bad_settings():
