@@ -40,7 +40,9 @@ def load_scene(path: str | Path, variables: Mapping[str, object]) -> "mi.Scene":
     if not Path(path).is_file():
         raise UserError(f"no scene at {path}: check the path")
     try:
-        return mi.load_file(str(path), **{name: str(value) for name, value in variables.items()})
+        # In parallel, surfels that wait for Dr.Jit may take over the reading of an EXR, whose own tasks wait for a thread that
+        # waits for Python, to make another of our plugins: for ever.
+        return mi.load_file(str(path), parallel=False, **{name: str(value) for name, value in variables.items()})
     except UserError:
         raise
     except Exception as error:  # Mitsuba wraps what a plugin raises, its traceback included

@@ -39,7 +39,7 @@ def export(
 
     The scene is the one that was fitted with the results in place of where the fit started, its ``shading``, and a sensor of
     ``spp`` samples per pixel for each of ``views``, whose id is the view's name:
-    ``mi.render(mi.load_file("scene.xml"), sensor=i)``.
+    ``mi.render(mi.load_file("scene.xml", parallel=False), sensor=i)``.
     Raises: UserError where the disk is full or the folder can't be written.
     """
     folder = Path(folder)

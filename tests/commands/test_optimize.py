@@ -59,7 +59,7 @@ def test_files(run):
 
 
 def test_exported_scene_renders_the_same(run):
-    scene = mi.load_file(str(run / "scene.xml"))
+    scene = mi.load_file(str(run / "scene.xml"), parallel=False)
     np.testing.assert_array_equal(
         np.array(mi.traverse(scene)["environment.data"])[:, 1:-1], np.array(mi.Bitmap(str(run / "environment.exr")))
     )
@@ -71,12 +71,12 @@ def test_exported_scene_renders_the_same(run):
 def test_presets(inputs, tmp_path, preset):
     folder = fit(*inputs, tmp_path / "run", config=preset, overrides=[*SMALL, "iterations=3"])
     assert (folder / "guided.png").exists() == (preset == "paper")
-    assert_renders_as_written(mi.load_file(str(folder / "scene.xml")), folder)
+    assert_renders_as_written(mi.load_file(str(folder / "scene.xml"), parallel=False), folder)
 
 
 def test_indirect_light_is_exported(inputs, tmp_path):
     folder = fit(*inputs, tmp_path / "run", overrides=[*SMALL, "indirect=one_bounce", "indirect_start=0"])
-    scene = mi.load_file(str(folder / "scene.xml"))
+    scene = mi.load_file(str(folder / "scene.xml"), parallel=False)
     assert scene.integrator().indirect == "one_bounce"
     assert_renders_as_written(scene, folder)
 
@@ -95,7 +95,7 @@ def test_shading_is_the_scenes(inputs, tmp_path, old, new):
     other = tmp_path / "other.xml"
     other.write_text(scene.read_text().replace(old, new))
     folder = fit(other, data, tmp_path / "run", overrides=[*SMALL, "iterations=3"])
-    assert_renders_as_written(mi.load_file(str(folder / "scene.xml")), folder)
+    assert_renders_as_written(mi.load_file(str(folder / "scene.xml"), parallel=False), folder)
 
 
 def test_photographs_without_masks(inputs, tmp_path):
@@ -133,7 +133,7 @@ def test_photographs_without_masks(inputs, tmp_path):
     assert process.returncode == 0 and error == "", error
     figures = metrics(tmp_path / "run")
     assert figures["finished"] and figures["psnr"] > 8 and figures["normal_mae_deg"] is None
-    scene = mi.load_file(str(tmp_path / "run" / "scene.xml"))
+    scene = mi.load_file(str(tmp_path / "run" / "scene.xml"), parallel=False)
     assert 1 < scene.integrator().box.radius < 6
     assert np.linalg.norm(mi.traverse(scene)["object.centers"].numpy(), axis=1).max() > 10
     assert_renders_as_written(scene, tmp_path / "run")

@@ -68,7 +68,7 @@ def test_fit(inputs, tmp_path, monkeypatch, layout):
     figures = json.loads((folder / "metrics.json").read_text())
     assert figures["finished"] and figures["iterations"] == 30 and figures["psnr"] > 10
     assert figures["train_views"] + figures["test_views"] == 9
-    scene = mi.load_file(str(folder / "scene.xml"))
+    scene = mi.load_file(str(folder / "scene.xml"), parallel=False)
     centers = mi.traverse(scene)["object.centers"].numpy()
     if layout == "nero":  # its masks make a hull, and no surroundings
         assert scene.integrator().box is None and np.linalg.norm(centers, axis=1).max() < 12
