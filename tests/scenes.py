@@ -3,7 +3,9 @@
 import numpy as np
 
 from rgs_mi.core.camera import Camera
-from rgs_mi.surfels.surfels import Surfels, rotation_from_normal
+from rgs_mi.shading import deferred
+from rgs_mi.shading.lighting import lighting_of
+from rgs_mi.surfels.surfels import CHANNELS, Surfels, rotation_from_normal
 
 
 def sphere_surfels(n, seed=0, scale=0.6, opacity_shift=1.0, order=1):
@@ -69,3 +71,15 @@ def layered_surfels(camera, seed):
             "scales": rng.uniform(0.15, 0.3, (n, 2)),
         }
     )
+
+
+def shape(surfels):
+    """The dict of the plugin `surfels` that has the fields of ``surfels``."""
+    return {"type": "surfels"} | {name: getattr(surfels, name) for name in CHANNELS}
+
+
+def colors(surfels, camera, shading, light):
+    """[3, W · H] of what ``camera`` sees of ``surfels``, shaded as ``shading`` says under the `Environment` ``light``."""
+    emitter = light.emitter() if shading.specular == "monte_carlo" else None
+    seen = light.unfiltered() if emitter else light.filtered()
+    return deferred.render(surfels, camera, lighting_of(shading, surfels, seen, emitter)).color.numpy()

@@ -7,6 +7,7 @@ import numpy as np
 from rgs_mi.core.color import exposed, to_8bit
 from rgs_mi.core.files import write_exr
 from rgs_mi.datasets.types import View
+from rgs_mi.evaluation import metrics
 from rgs_mi.surfels.ply import write_ply
 from rgs_mi.viewer import passes
 from rgs_mi.viewer.look import Look
@@ -69,7 +70,7 @@ def photographs(subject) -> list[View]:
 def psnr(a, b):
     """In dB, of pictures of 8 bits, or of display values in [0, 1]."""
     scale = 255 if np.asarray(a).dtype == np.uint8 else 1
-    return -10 * np.log10(max(np.mean((np.float64(a) / scale - np.float64(b) / scale) ** 2), 1e-12))
+    return metrics.psnr(np.asarray(a) / scale, np.asarray(b) / scale)
 
 
 class Panel:

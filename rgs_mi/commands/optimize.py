@@ -138,7 +138,7 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
         extent = box.radius
         points = _with_surroundings(points, dataset, settings)
 
-    middle = points[0].mean(0) if box is None else 0.5 * (np.array(box.min) + box.max)
+    middle = points[0].mean(0) if box is None else box.center
 
     def fit_of(shown, settings):
         positions, normals, colors, spacing = points
@@ -212,8 +212,8 @@ def _resume(saved, scene, dataset, settings) -> Fit:
         raise UserError(f"{dataset.root}: not the photographs of the checkpoint: give its --data, or another --out")
     old, new = _flat(meta["settings"]), _flat(to_dict(settings))
     changed = [key for key in new if old.get(key) != new[key]]
-    if fixed := [key for key in ("sh_order", "shader") if key in changed]:
-        raise UserError(f"{fixed[0]} is {old[fixed[0]]} in the checkpoint and can't change: choose another --out")
+    if fixed := [key for key in ("sh_order", "shader", "room") if key in changed]:
+        raise UserError(f"{fixed[0]} is {old.get(fixed[0])} in the checkpoint and can't change: choose another --out")
     if changed:
         listing = ", ".join(f"{key} {old.get(key)} -> {new[key]}" for key in changed)
         print(f"settings differ from the checkpoint's, the new ones hold: {listing}", file=sys.stderr)

@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..core.errors import UserError
+from ..core.runtime import HOST, PORT
 from ..core.scene_files import load_scene
 from ..datasets import load_dataset
 from ..datasets.resolution import LONGEST
 from ..export.mitsuba_scene import SCENE
 from ..report.results import METRICS
-from ..viewer.server import HOST, PORT, Server, check
+from ..viewer.server import Server, check
 from ..viewer.subject import Subject
 
 

@@ -16,6 +16,8 @@ from .errors import UserError
 MIN_LLVM = 16
 VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 CACHE_VARIABLE = "RGS_MI_CACHE"
+#: Where the page of a window is, unless someone says otherwise.
+HOST, PORT = "localhost", 8080
 _VARIABLE = "DRJIT_LIBLLVM_PATH"
 _REMEDY = (
     f"install one (Debian: `apt install libllvm19`, macOS: `brew install llvm`, Linux x86-64: "

@@ -43,14 +43,12 @@ class Indirect:
     kind                   what a ray brings from a surfel that it meets: nothing, or that surfel's radiance
     proxies                the quads that rays meet, perhaps of a few steps ago
     surfels                the surfels as they are
-    box                    in which they reflect light (None: everywhere); those beyond have their own radiance alone
     irradiance_visibility  a of (9), one entry per surfel (None: 1 for all)
     """
 
     kind: Literal["visibility", "one_bounce"]
     proxies: Proxies
     surfels: Surfels
-    box: BoundingBox | None = None
     irradiance_visibility: "mi.Color3f | None" = None
 
     def incident_radiance(
@@ -109,14 +107,14 @@ class Indirect:
             dr.eval(coming, radiance)
         return coming / dr.maximum(radiance, 1e-6)
 
-    def with_visibility_as_radiance(self, surfels: Surfels) -> Surfels:
-        """Return ``surfels`` whose radiance is their `irradiance_visibility`, in the `box`, to be splatted. That must be
-        known."""
+    def with_visibility_as_radiance(self, surfels: Surfels, box: BoundingBox | None) -> Surfels:
+        """Return ``surfels`` whose radiance is their `irradiance_visibility`, in the ``box`` (None: everywhere), to be
+        splatted. That must be known."""
         visibility = self.irradiance_visibility
         assert visibility is not None, "with_irradiance_visibility() comes first"
         shape = surfels.sh.shape
         sh, row = dr.copy(surfels.sh.array), dr.arange(mi.UInt32, len(surfels)) * shape[1]
-        inside = mi.Bool(True) if self.box is None else self.box.contains(surfels.column(mi.Point3f, "centers"))
+        inside = mi.Bool(True) if box is None else box.contains(surfels.column(mi.Point3f, "centers"))
         for k in range(shape[1]):
             dr.scatter(sh, (visibility[k] - 0.5) / SH_0 if k < 3 else mi.Float(0), row + k, inside)
         return replace(surfels, sh=mi.TensorXf(sh, shape))

@@ -151,7 +151,7 @@ class Lighting:
     def as_splatted(self, surfels: Surfels) -> Surfels:
         """Return the surfels to splat: what is lit has no radiance of its own, but its irradiance visibility in its place."""
         indirect = self._with_visibility
-        return surfels if indirect is None else indirect.with_visibility_as_radiance(surfels)
+        return surfels if indirect is None else indirect.with_visibility_as_radiance(surfels, self.box)
 
     def irradiance_visibility(self, maps: Maps, mean: "mi.Float") -> "mi.Color3f | float":
         """Return the irradiance visibility of pixels of these ``maps``, which ``mean`` divides by their coverage."""
@@ -209,7 +209,7 @@ def lighting_of(
     indirect = None
     if shading.indirect != "none":
         proxies = Proxies(surfels, box=shading.box) if proxies is None else proxies
-        indirect = Indirect(shading.indirect, proxies, surfels, shading.box, irradiance_visibility)
+        indirect = Indirect(shading.indirect, proxies, surfels, irradiance_visibility)
     lighting = Lighting(estimator, shader, indirect, lit, shading.box, shading.turntable)
     # Where the light is sampled, its rays say by themselves what is hidden
     needs_visibility = lit and indirect is not None and not sampled and irradiance_visibility is None

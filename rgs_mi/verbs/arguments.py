@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.errors import listed
+from ..core.runtime import HOST, PORT
 from ..core.scene_files import bundled
 
 #: What a verb does with its arguments: returns the exit code, or None for 0.
@@ -64,9 +65,9 @@ def add_out(parser: argparse.ArgumentParser, default: str, text: str) -> None:
 def add_address(parser: argparse.ArgumentParser) -> None:
     """Add --host and --port, where a window's page is."""
     parser.add_argument(
-        "--host", default="localhost", help="address to listen at; 0.0.0.0 lets other machines in (default: %(default)s)"
+        "--host", default=HOST, help="address to listen at; 0.0.0.0 lets other machines in (default: %(default)s)"
     )
-    add_integer(parser, "--port", 8080, "of the page, 0 for any that is free")
+    add_integer(parser, "--port", PORT, "of the page, 0 for any that is free")
 
 
 def add_variables(parser: argparse.ArgumentParser) -> None:

@@ -41,7 +41,7 @@ def render(parser: Parser) -> Run:
         "what it looks at, up, horizontal field of view; again for more, which --path goes through",
     )
     parser.add_argument(
-        "--size", type=_size, metavar="W|WxH", help="width in pixels, or width and height (default: the sensor's)"
+        "--size", type=_width_or_both, metavar="W|WxH", help="width in pixels, or width and height (default: the sensor's)"
     )
     parser.add_argument(
         "--spp", type=int, help="samples per pixel; for surfels alone a square number (default: as the scene says)"
@@ -104,7 +104,7 @@ def render(parser: Parser) -> Run:
     return run
 
 
-def _size(text):
+def _width_or_both(text):
     """A width, or (width, height)."""
     width, times, height = text.partition("x")
     return (int(width), int(height)) if times else int(width)

@@ -8,10 +8,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.runtime import HOST, PORT
 from ..fit.trainer import Fit
 from ..surfels.surfels import CHANNELS, Surfels
 from .lights import Lights
-from .server import HOST, PORT, Server
+from .server import Server
 from .subject import Subject
 from .window import Window
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..core.camera import Camera
 from ..export.render import pose
@@ -107,14 +108,9 @@ def window_camera(
     width, height = size
     if not (length > 1e-6 and 1e-3 < fov < 3 and 1 <= width <= 1 << 14 and 1 <= height <= 1 << 14):
         return None
-    w, x, y, z = numbers[:4] / length
     to_world = np.eye(4)
     to_world[:3, 3] = numbers[4:7]
-    to_world[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
+    to_world[:3, :3] = Rotation.from_quat(np.roll(numbers[:4], -1)).as_matrix()
     scale = min(1.0, (pixels / (width * height)) ** 0.5)
     width, height = max(1, round(width * scale)), max(1, round(height * scale))
     focal = 0.5 * height / np.tan(fov / 2)
@@ -123,7 +119,4 @@ def window_camera(
 
 def quaternion(to_world: np.ndarray) -> np.ndarray:
     """Return the unit quaternion (w, x, y, z) of the rotation in ``to_world`` [4, 4], camera space to world space."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(to_world[:3, :3]).as_quat()
-    return np.array([w, x, y, z])
+    return np.roll(Rotation.from_matrix(to_world[:3, :3]).as_quat(), 1)

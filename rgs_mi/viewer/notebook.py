@@ -7,8 +7,9 @@ from pathlib import Path
 
 import mitsuba as mi
 
+from ..core.runtime import HOST
 from ..datasets.types import View
-from .server import HOST, Server
+from .server import Server
 from .subject import Subject
 
 _BREATH = 0.005  # seconds in which other work of the same loop is done, from one pass to the next

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..core.errors import UserError
+from ..core.runtime import HOST, PORT
 from .frusta import Frusta
 from .look import Look, window_camera
 from .pace import GRIDS, Pace
@@ -22,7 +23,6 @@ from .window import Window
 if TYPE_CHECKING:
     import viser
 
-HOST, PORT = "localhost", 8080
 _IDLE = 60.0  # seconds that `run` sleeps at most
 
 

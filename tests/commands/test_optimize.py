@@ -173,6 +173,8 @@ def test_resume_after_a_crash(inputs, tmp_path, monkeypatch, capsys):
     assert "weights.mask 0.1 -> 0.2" in capsys.readouterr().err
     with pytest.raises(UserError, match="sh_order"):
         fit(*inputs, tmp_path, overrides=[*SMALL, "sh_order=0"], resume=True)
+    with pytest.raises(UserError, match="room is None in the checkpoint and can't change"):
+        fit(*inputs, tmp_path, overrides=[*SMALL, "room=4"], resume=True)
     fit(*inputs, tmp_path, overrides=[*SMALL, "iterations=2"])  # a finished run may be overwritten
     assert metrics(tmp_path)["iterations"] == 2
 

@@ -16,9 +16,8 @@ from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.lighting import Lighting, Shading, lighting_of
 from rgs_mi.shading.split_sum import SplitSum
 from rgs_mi.surfels.proxies import Proxies
-from rgs_mi.surfels.surfels import CHANNELS
 
-from scenes import orbit_camera, sphere_surfels
+from scenes import orbit_camera, shape, sphere_surfels
 
 BOX = BoundingBox((-2.0, -2.0, -2.0), (2.0, 0.0, 2.0))  # half of the unit sphere
 
@@ -111,9 +110,8 @@ def test_what_lies_beyond_the_box_radiates_as_it_was_photographed():
 
 def test_in_scenes():
     surfels = sphere_surfels(800, scale=1.0)
-    shape = {"type": "surfels"} | {name: getattr(surfels, name) for name in CHANNELS}
     sensor = mi.load_dict(orbit_camera(0.3).to_sensor_dict())
-    scene = mi.load_dict({"type": "scene", "object": shape, "light": {"type": "constant"}})
+    scene = mi.load_dict({"type": "scene", "object": shape(surfels), "light": {"type": "constant"}})
     image = lambda kind, **more: np.array(
         mi.render(scene, sensor=sensor, spp=4, integrator=mi.load_dict({"type": kind, "hide_emitters": True, **more}))
     )

@@ -18,7 +18,7 @@ from rgs_mi.shading.room import Room
 from rgs_mi.shading.split_sum import SplitSum
 from rgs_mi.shading.surface import Surface
 
-from scenes import orbit_camera, sphere_surfels
+from scenes import colors, orbit_camera, shape, sphere_surfels
 
 CENTER, DISTANCES = np.array([0.2, -0.1, 0.3]), (2.0, 1.5, 3.0, 1.2, 1.8, 2.5)  # to -x, +x, -y, ... in the map's frame
 ROTATION = Rotation.from_euler("xyz", [80, 20, -30], degrees=True).as_matrix()
@@ -175,20 +175,14 @@ def test_what_a_surface_reflects_is_what_the_path_tracer_sees():
             assert np.all(np.abs(near - seen.mean(1)) < 0.15 * seen.mean(1) + 0.03)
 
 
-def render(surfels, camera, shading, light):
-    emitter = light.emitter() if shading.specular == "monte_carlo" else None
-    seen = light.unfiltered() if emitter else light.filtered()
-    return deferred.render(surfels, camera, lighting_of(shading, surfels, seen, emitter)).color.numpy()
-
-
 @pytest.mark.parametrize("diffuse", ["radiance", "lit"])
 @pytest.mark.parametrize("specular", ["split_sum", "monte_carlo"])
 def test_walls_far_away_are_light_at_infinity(specular, diffuse):
     surfels, light, camera = sphere_surfels(200, scale=0.9, opacity_shift=3), painted(32), orbit_camera()
     shading = Shading(specular=specular, diffuse=diffuse, indirect="one_bounce", samples=4)
-    infinite = render(surfels, camera, shading, replace(light, room=None))
-    far = render(surfels, camera, shading, replace(light, room=room([1e5] * 6)))
-    near = render(surfels, camera, shading, light)
+    infinite = colors(surfels, camera, shading, replace(light, room=None))
+    far = colors(surfels, camera, shading, replace(light, room=room([1e5] * 6)))
+    near = colors(surfels, camera, shading, light)
     assert np.mean(np.abs(far - infinite) > 1e-2) < 2e-3  # a sample may fall to the other side of something
     assert np.abs(near - infinite).mean() > 20 * np.abs(far - infinite).mean()
 
@@ -225,10 +219,10 @@ def test_a_room_goes_round_with_the_camera():
     turn = Rotation.from_matrix(np.array(table.to_lamps(camera)).reshape(3, 3)).inv().as_matrix()
     turned = replace(light, rotation=turn @ ROTATION)
     shading = Shading(indirect="one_bounce")
-    expected = render(surfels, camera, shading, turned)
-    found = render(surfels, camera, replace(shading, turntable=table), light)
+    expected = colors(surfels, camera, shading, turned)
+    found = colors(surfels, camera, replace(shading, turntable=table), light)
     assert np.mean(np.abs(found - expected) > 1e-2) < 2e-3
-    assert np.abs(render(surfels, camera, shading, light) - expected).mean() > 20 * np.abs(found - expected).mean()
+    assert np.abs(colors(surfels, camera, shading, light) - expected).mean() > 20 * np.abs(found - expected).mean()
 
 
 def test_learned_with_the_surfels():
@@ -239,7 +233,7 @@ def test_learned_with_the_surfels():
     surfels = type(surfels).from_numpy({**fields, "sh": np.zeros_like(fields["sh"]) - 10})
     cameras = [orbit_camera(a) for a in np.linspace(0, 6, 8)]
     light = painted(64)
-    truth = [mi.Color3f(render(surfels, c, Shading(), light)) for c in cameras]
+    truth = [mi.Color3f(colors(surfels, c, Shading(), light)) for c in cameras]
     optimizer = mi.ad.Adam(lr=0.05)
     optimizer["log_nearness"] = mi.Float(np.log([1 / 4.0] * 6))
     for step in range(120):
@@ -268,22 +262,25 @@ def test_written_and_read():
 
 
 def test_scene_files_say_so():
-    surfels, light, camera = sphere_surfels(100, scale=0.9), painted(32), orbit_camera(2.2)
-    params = mi.traverse(shape := mi.load_dict({"type": "surfels"}))
-    for name, value in surfels.numpy().items():
-        params[name] = mi.TensorXf(value)
-    params.update()
+    far = tuple(3 * d for d in DISTANCES)  # walls around the sensor, too
+    surfels, light, camera = sphere_surfels(100, scale=0.9), painted(256, far), orbit_camera(3.2, distance=6)
     placed = mi.ScalarTransform4f(np.block([[light.rotation, np.zeros((3, 1))], [0, 0, 0, 1]]))
     scene = mi.load_dict(
         {
             "type": "scene",
-            "shape": shape,
+            "shape": shape(surfels),
             "sensor": camera.to_sensor_dict(),
             "emitter": {"type": "envmap", "bitmap": mi.Bitmap(light.texels.numpy()), "to_world": placed},
             "integrator": {"type": "rgs_deferred", "hide_emitters": True, "room": str(light.room)},
         }
     )
-    found = np.array(mi.render(scene, spp=1))[..., :3]
-    expected = render(surfels, camera, Shading(), light).T.reshape(found.shape)
+    found = np.array(mi.render(scene, spp=1))
+    expected = colors(surfels, camera, Shading(), light).T.reshape(found.shape)
     assert np.abs(found - expected).max() < 2e-3
+    # behind the surfels are the walls, as they are seen from where the sensor stands
     scene.integrator().hide_emitters = False
+    behind, empty = np.array(mi.render(scene, spp=1)), (found == 0).all(axis=-1)
+    rays = (camera.rays() / np.linalg.norm(camera.rays(), axis=-1, keepdims=True))[empty] @ ROTATION
+    place = (camera.origin - CENTER) @ ROTATION
+    walls_met = COLORS[[met(place, ray, far)[1] for ray in rays]]
+    assert empty.sum() > 200 and np.mean(np.abs(behind[empty] - walls_met).max(1) < 0.02) > 0.85  # but for blurred edges

@@ -15,7 +15,7 @@ from rgs_mi.shading import deferred
 from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.lighting import Shading, lighting_of
 
-from scenes import orbit_camera, sphere_surfels
+from scenes import colors, orbit_camera, shape, sphere_surfels
 
 AXIS, POINT = np.array([0.1, -0.2, 0.97]) / np.linalg.norm([0.1, -0.2, 0.97]), (0.1, 0.05, -0.1)
 TABLE = Turntable((float(AXIS[0]), float(AXIS[1]), float(AXIS[2])), POINT)
@@ -31,13 +31,6 @@ def azimuth(camera, table=TABLE):
 def environment(seed=0):
     texels = np.random.default_rng(seed).uniform(0.1, 2, (16, 32, 3)).astype(np.float32)
     return Environment(mi.TensorXf(texels), Rotation.from_euler("xyz", [80, 20, -30], degrees=True).as_matrix())
-
-
-def render(surfels, camera, shading, light):
-    emitter = light.emitter() if shading.specular == "monte_carlo" else None
-    seen = light.unfiltered() if emitter else light.filtered()
-    image = deferred.render(surfels, camera, lighting_of(shading, surfels, seen, emitter))
-    return image.color.numpy()
 
 
 def test_rotation_is_that_of_a_slow_twin():
@@ -71,9 +64,9 @@ def test_light_goes_round_with_the_camera(specular, indirect, diffuse):
     for angle in (0.3, 3.0):
         camera = orbit_camera(angle)
         turned = replace(light, rotation=Rotation.from_rotvec(AXIS * azimuth(camera)).as_matrix() @ light.rotation)
-        expected = render(surfels, camera, shading, turned)
-        found = render(surfels, camera, replace(shading, turntable=TABLE), light)
-        still = render(surfels, camera, shading, light)
+        expected = colors(surfels, camera, shading, turned)
+        found = colors(surfels, camera, replace(shading, turntable=TABLE), light)
+        still = colors(surfels, camera, shading, light)
         # single numbers jump where a sample falls to the other side of something
         assert np.mean(np.abs(found - expected) > 1e-3) < 2e-3
         assert np.abs(found - still).mean() > 20 * np.abs(found - expected).mean() > 0
@@ -139,10 +132,6 @@ def test_written_and_read():
 
 def test_scene_files_say_so():
     surfels, light, camera = sphere_surfels(100, scale=0.9), environment(), orbit_camera(2.2)
-    params = mi.traverse(shape := mi.load_dict({"type": "surfels"}))
-    for name, value in surfels.numpy().items():
-        params[name] = mi.TensorXf(value)
-    params.update()
     turn = mi.ScalarTransform4f(
         np.block([[Rotation.from_rotvec(AXIS * azimuth(camera)).as_matrix(), np.zeros((3, 1))], [0, 0, 0, 1]])
     )
@@ -153,7 +142,7 @@ def test_scene_files_say_so():
                 {
                     "type": "scene",
                     "integrator": {"type": "rgs_deferred", **integrator},
-                    "shape": shape,
+                    "shape": shape(surfels),
                     "emitter": {"type": "envmap", "bitmap": mi.Bitmap(light.texels.numpy()), "to_world": to_world},
                 }
             ),
