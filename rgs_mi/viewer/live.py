@@ -87,7 +87,7 @@ class Watch:
         for gone in self._controls.keys() - self._server.windows.keys():
             self._controls.pop(gone, None)
 
-    def _enter(self, client: "viser.ClientHandle", window: Window) -> None:
+    def _enter(self, server: Server, client: "viser.ClientHandle", window: Window) -> None:
         window.hurried = not self.paused
         self._controls[client.client_id] = _Controls(client, self)
 

@@ -30,8 +30,8 @@ class Server:
     """Shows a ``subject`` to browsers at ``address``. All that Dr.Jit computes is computed in `turn`, by whoever calls it: one
     thread alone.
 
-    ``name``: of the scene or run, in commands and files. ``port`` 0 is any that is free. ``entered(client, window)`` is called
-    for every window, and may add controls of its own.
+    ``name``: of the scene or run, in commands and files. ``port`` 0 is any that is free. ``entered(server, client, window)`` is
+    called for every window, and may add controls of its own.
     Raises: UserError where viser is not installed, or the port is taken.
     """
 
@@ -41,7 +41,7 @@ class Server:
         name: str,
         host: str = HOST,
         port: int = PORT,
-        entered: "Callable[[viser.ClientHandle, Window], None]" = lambda client, window: None,
+        entered: "Callable[[Server, viser.ClientHandle, Window], None] | None" = None,
     ) -> None:
         self.subject, self.name, self.pace = subject, name, Pace()
         self.windows: dict[int, Window] = {}
@@ -81,7 +81,8 @@ class Server:
         if camera is None:
             return
         window = Window(Look(camera), self.wake.set)
-        self._entered(client, window)
+        if self._entered is not None:
+            self._entered(self, client, window)
         panel = Panel(client, window, self)
         frusta = Frusta(client, window, self.subject)
         panel.frusta = frusta

@@ -3,12 +3,15 @@
 import shutil
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 import rgs_mi
+from rgs_mi.core.errors import UserError
+from rgs_mi.viewer.exports import Exports
 from rgs_mi.viewer.pace import GRIDS
 from rgs_mi.viewer.server import Server
 
@@ -19,6 +22,17 @@ from windows import psnr
 _WINDOW = {"width": 640, "height": 360}
 _VIEW = {"x": 0, "y": 0, "width": 300, "height": 360}  # the picture, beside the panel
 _MIDDLE = 155, 250  # of it, clear of what viser says of WebGL
+WRITTEN: list[str] = []  # formats
+
+
+def write(to):
+    if to == "usd":
+        raise UserError("usd needs a package")
+    WRITTEN.append(to)
+    return [Path(f"runs/ball/export/{to}/splats.ply")]
+
+
+EXPORTS = Exports(("splat", "usd"), write)
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +41,7 @@ def served(subject):
     if not any(map(shutil.which, browser.NAMES)):
         pytest.skip("needs Chromium: apt-get install chromium")
     rgs_mi.set_variant()
-    server, closed = Server(subject, "runs/ball", port=0), threading.Event()
+    server, closed = Server(subject, "runs/ball", port=0, entered=EXPORTS.offer), threading.Event()
     server.pace.seconds = dict.fromkeys(GRIDS, 9.0) | {GRIDS[0]: 0.01}  # the others are compiled elsewhere
     thread = threading.Thread(target=server.run, args=(closed.is_set,), daemon=True)
     thread.start()
@@ -127,6 +141,18 @@ def test_orbit_map_light(served, tab, tmp_path):
     assert psnr(relit, turned) < 40
     (window,) = served.windows.values()
     assert window.look.rotate == 120 and window.look.map == "picture" and tab.errors == []
+
+
+def test_exports(served, tab):
+    """What a page asks for is written by the thread that renders, and the page tells where, or why not."""
+    open_folder(tab, "Export")
+    tab.get_by_role("button", name="export", exact=True).click()
+    tab.get_by_text("runs/ball/export/splat/splats.ply").wait_for(timeout=1000 * PATIENCE)
+    assert WRITTEN == ["splat"]
+    choose(tab, "format", "usd")
+    tab.get_by_role("button", name="export", exact=True).click()
+    tab.get_by_text("usd needs a package").wait_for(timeout=1000 * PATIENCE)
+    assert WRITTEN == ["splat"] and tab.errors == []
 
 
 def test_two_windows_see_their_own(served, tab, tmp_path):
