@@ -11,7 +11,7 @@ from ..core.scene_files import load_scene
 from ..datasets import load_dataset
 from ..datasets.resolution import LONGEST
 from ..export.mitsuba_scene import SCENE
-from ..report.results import METRICS
+from ..report.results import METRICS, finished
 from ..viewer.exports import Exports
 from ..viewer.server import Server, check
 from ..viewer.subject import Subject
@@ -43,8 +43,8 @@ def view(
     scene = path / SCENE if path.is_dir() else path
     subject = Subject.of(load_scene(scene, variables or {}), envmaps)  # whose light is filtered meanwhile, in a thread
     subject.compare_with(_photographs(path, data))
-    exports = Exports(FORMATS, lambda to: export(path, to, quiet=True)) if (path / METRICS).is_file() else None
-    server = Server(subject, str(path), host, port, exports and exports.offer)
+    offer = Exports(FORMATS, lambda to: export(path, to, quiet=True)).offer if finished(path) else None
+    server = Server(subject, str(path), host, port, offer)
     print(f"{server.address} (Ctrl-C closes it)", flush=True)
     try:
         server.run()
