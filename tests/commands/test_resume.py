@@ -1,6 +1,6 @@
 """Killed at random moments and resumed, a fit ends where an undisturbed one does.
 
-``python tests/test_resume.py 20`` does it with twenty kills.
+``python tests/commands/test_resume.py 20`` does it with twenty kills.
 """
 
 import json
@@ -19,21 +19,27 @@ TOLERANCE = 0.2  # dB: sums of floats differ from run to run
 
 
 def kill_and_resume(folder: Path, kills: int, seed=0) -> tuple[float, float, int]:
-    """(PSNR undisturbed, PSNR after being killed, kills that hit a running fit)."""
+    """(PSNR undisturbed, PSNR after being killed, kills that hit a fit which had saved something of its own)."""
     scene, data = make_inputs(folder, size=96)
     options = [scene, "--data", data, *OPTIONS]
-    begin = time.monotonic()
     finish(start_script("optimize.py", *options, "--out", folder / "whole"))
-    fitting = metrics(folder / "whole")["train_seconds"]
-    around, rng, hits = time.monotonic() - begin - fitting, random.Random(seed), 0  # start, evaluation
-    for _ in range(kills):
+    rng, hits = random.Random(seed), 0
+    for kill in range(kills):
+        saved = newest_checkpoint(folder / "killed")
         process = start_script("optimize.py", *options, "--out", folder / "killed", "--resume")
-        time.sleep(rng.uniform(0.2, 0.5) * around + rng.uniform(0, 2) * fitting / (kills + 1))
-        hits += process.poll() is None
+        if kill % 4 < 3:  # after it has saved; otherwise at any moment, while it starts as a rule
+            while process.poll() is None and newest_checkpoint(folder / "killed") == saved:
+                time.sleep(0.01)
+        time.sleep(rng.uniform(0, 0.5))
+        hits += process.poll() is None and newest_checkpoint(folder / "killed") != saved
         process.kill()
         process.communicate()
     finish(start_script("optimize.py", *options, "--out", folder / "killed", "--resume"))
     return metrics(folder / "whole")["psnr"], metrics(folder / "killed")["psnr"], hits
+
+
+def newest_checkpoint(run):
+    return max((path.name for path in run.glob("checkpoints/step_*.npz")), default=None)
 
 
 def metrics(run):
