@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+import rgs_mi  # before mitsuba, which runs imports
+
 from runs import make_inputs, start_script
 
 OPTIONS = ["--quiet", "--set", "iterations=300", "--set", "initialization.surfels=2000", "--set", "checkpoint_seconds=0.3"]
@@ -59,12 +61,7 @@ def test_killed_and_resumed(tmp_path):
 
 
 if __name__ == "__main__":
-    import rgs_mi
-
     rgs_mi.set_variant()
     with tempfile.TemporaryDirectory() as temporary:
-        print(
-            "undisturbed {:.2f} dB, killed {:.2f} dB, {} of the kills hit".format(
-                *kill_and_resume(Path(temporary), int(sys.argv[1]))
-            )
-        )
+        whole, killed, hits = kill_and_resume(Path(temporary), int(sys.argv[1]))
+        print(f"undisturbed {whole:.2f} dB, killed {killed:.2f} dB, {hits} of the kills hit")
