@@ -4,6 +4,7 @@ import json
 import struct
 
 import numpy as np
+import pytest
 from scipy.special import sph_harm_y
 
 
@@ -51,3 +52,12 @@ def glb_splats(path):
     own = lambda name: of("KHR_gaussian_splatting:" + name)
     sh = np.stack([own(f"SH_DEGREE_{degree}_COEF_{k}") for degree in range(4) for k in range(2 * degree + 1)], 1)
     return (of("POSITION"), own("ROTATION"), own("SCALE"), own("OPACITY"), sh), document, of("COLOR_0")
+
+
+def decoded(path):
+    """Frames of a video: ([frames, H, W, 3] uint8, what the file says of itself)."""
+    encoder = pytest.importorskip("imageio_ffmpeg")
+    reader = encoder.read_frames(str(path))
+    meta = next(reader)
+    width, height = meta["size"]
+    return np.array([np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader]), meta

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from urllib.parse import urlsplit
 
 
 def number(value: object, low: float, high: float) -> float | None:
@@ -14,3 +15,9 @@ def number(value: object, low: float, high: float) -> float | None:
 def choice(value: object, options: Sequence[str]) -> str | None:
     """Return what a page chose, None where that was not offered."""
     return value if isinstance(value, str) and value in options else None
+
+
+def same_origin(origin: str | None, host: str | None) -> bool:
+    """Return whether what opened a socket is no other site's page, which the same browser shows: its ``origin`` is the ``host``
+    that it asked for (both as headers have them, RFC 6454). What is no browser tells no origin."""
+    return origin is None or host is not None and urlsplit(origin).netloc.lower() == host.lower()

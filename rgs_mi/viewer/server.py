@@ -3,6 +3,7 @@
 import contextlib
 import io
 import socket
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -12,6 +13,7 @@ import numpy as np
 
 from ..core.errors import UserError
 from ..core.runtime import HOST, PORT
+from .checks import same_origin
 from .frusta import Frusta
 from .look import Look, window_camera
 from .pace import GRIDS, Pace
@@ -51,6 +53,7 @@ class Server:
         self._later: deque[Callable[[], None]] = deque()  # and that can wait
         self._panels: dict[int, Panel] = {}
         self._turns: deque[int] = deque()  # windows, the one that has waited longest first
+        self._turned_away: set[str] = set()  # origins of other sites' pages
         self._page = _open(host, port)
         self.address = f"http://{host}:{self._page.get_port()}"
         self._page.gui.configure_theme(show_share_button=False, show_logo=False)
@@ -77,6 +80,8 @@ class Server:
         first.near, first.far = 1e-3 * distance, 1e3 * distance
 
     async def _enter(self, client: "viser.ClientHandle") -> None:
+        if await self._turn_away(client):
+            return
         camera = _camera(client)
         if camera is None:
             return
@@ -95,6 +100,19 @@ class Server:
         self._panels[client.client_id], self.windows[client.client_id] = panel, window
         self._turns.append(client.client_id)
         self.wake.set()
+
+    async def _turn_away(self, client):
+        """Close the socket of a page of another site; whether it is one."""
+        connection = self._page._websock_server._live_connections[client.client_id]  # viser has no other way to its headers
+        headers = connection.request.headers
+        origin = headers.get("Origin")
+        if same_origin(origin, headers.get("Host")):
+            return False
+        if origin not in self._turned_away:  # it asks again and again
+            self._turned_away.add(origin)
+            print(f"a page of {origin!r} was turned away: open {self.address} itself", file=sys.stderr, flush=True)
+        await connection.close(1008, "open the page itself")
+        return True
 
     async def _leave(self, client: "viser.ClientHandle") -> None:
         for known in (self.windows, self._panels):

@@ -11,6 +11,7 @@ from rgs_mi.core.errors import UserError
 from rgs_mi.core.scene_files import load_scene
 from rgs_mi.export import render, video
 
+from readers import decoded
 from runs import PATIENCE, start_script
 
 SIZE = (31, 20)
@@ -26,15 +27,6 @@ def frames(tmp_path):
         paths.append(tmp_path / f"{k:03}.png")
         Image.fromarray(pixels).save(paths[-1])
     return paths
-
-
-def decoded(path):
-    """([frames, H, W, 3] uint8, what the file says of itself)."""
-    encoder = pytest.importorskip("imageio_ffmpeg")
-    reader = encoder.read_frames(str(path))
-    meta = next(reader)
-    width, height = meta["size"]
-    return np.array([np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader]), meta
 
 
 def test_video(frames, tmp_path):

@@ -1,5 +1,7 @@
 """The window in a browser: it draws, turns, relights, serves two at a time, and takes two hundred events without complaint."""
 
+import functools
+import http.server
 import shutil
 import threading
 import time
@@ -169,6 +171,34 @@ def test_two_windows_see_their_own(served, tab, tmp_path):
         with_second.close()
     wait(lambda: len(served.windows) == 1)  # and is forgotten
     assert len(served._panels) == len(served._turns) == 1
+
+
+def test_another_sites_page_is_turned_away(served, tab, capsys):
+    """Any site that the browser shows could open a socket to this machine, and draw, or export."""
+    import viser
+
+    folder = Path(viser.__file__).parent / "client" / "build"
+    handler = functools.partial(Quiet, directory=folder)
+    with http.server.ThreadingHTTPServer(("localhost", 0), handler) as other:
+        threading.Thread(target=other.serve_forever, daemon=True).start()
+        origin, before = f"http://localhost:{other.server_address[1]}", dict(served.windows)
+        page = tab.context.browser.new_page(viewport=_WINDOW)
+        try:
+            page.goto(f"{origin}/?websocket={served.address.replace('http', 'ws')}")
+            wait(lambda: served._turned_away == {origin})
+            page.wait_for_timeout(1500)  # it tries again
+        finally:
+            page.close()
+            other.shutdown()
+    assert served.windows == before
+    assert capsys.readouterr().err == f"a page of '{origin}' was turned away: open {served.address} itself\n"
+
+
+class Quiet(http.server.SimpleHTTPRequestHandler):
+    """Serves files, and tells nothing."""
+
+    def log_message(self, *_):
+        pass
 
 
 def test_two_hundred_events(served, tab):

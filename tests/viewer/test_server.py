@@ -10,7 +10,7 @@ import pytest
 
 from rgs_mi.core.errors import UserError
 from rgs_mi.viewer import window
-from rgs_mi.viewer.checks import choice, number
+from rgs_mi.viewer.checks import choice, number, same_origin
 from rgs_mi.viewer.look import Look
 from rgs_mi.viewer.server import Server
 from rgs_mi.viewer.window import Window
@@ -133,3 +133,10 @@ def test_values_of_pages_are_checked():
     assert [number(bad, 0, 1) for bad in (float("nan"), float("inf"), "1", None, [1])] == [None] * 5
     assert choice("a", ("a", "b")) == "a"
     assert [choice(bad, ("a", "b")) for bad in ("c", "../a", None, 1, ["a"])] == [None] * 5
+
+
+def test_origins():
+    assert same_origin("http://localhost:8080", "localhost:8080") and same_origin("https://Lab.org", "lab.org")
+    assert same_origin(None, "localhost:8080")  # no browser
+    others = ("http://localhost:8081", "http://evil.org:8080", "null", "http://localhost:8080.evil.org", "")
+    assert not any(same_origin(other, "localhost:8080") for other in others) and not same_origin("null", None)
