@@ -19,7 +19,8 @@ what a principled BSDF with the G-buffer's material reflects of the environment 
  * - diffuse
    - |string|
    - ``radiance``: the surfels' own, spherical harmonics; ``lit``: what their base colour, as a principled BSDF's, reflects
-     of the environment (Default: ``radiance``)
+     of the environment; ``relightable``: their own, of surfels whose base colours explain it, so that
+     `rgs_mi.export.relight` makes it ``lit`` where light or colours change (Default: ``radiance``)
 
  * - indirect
    - |string|
@@ -104,7 +105,7 @@ AOVS = {
     "diffuse": "RGB",
 }
 ESTIMATORS = ("split_sum", "monte_carlo", "none")
-DIFFUSE = ("radiance", "lit")
+DIFFUSE = ("radiance", "relightable", "lit")
 
 
 class DeferredIntegrator(mi.SamplingIntegrator):

@@ -36,7 +36,9 @@ class Panel:
 
     def show(self, picture):
         file = io.BytesIO()
-        Image.fromarray(picture.pixels).save(file, *(["PNG"] if picture.quality is None else ["JPEG"]), quality=picture.quality or 0)
+        Image.fromarray(picture.pixels).save(
+            file, *(["PNG"] if picture.quality is None else ["JPEG"]), quality=picture.quality or 0
+        )
         self.pictures.append((time.perf_counter(), picture))
 
 

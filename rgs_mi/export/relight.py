@@ -21,7 +21,7 @@ def relight(
     """Put another ``envmap`` (an image, latitude-longitude, or the name of an environment of the suite; None: as it is) into
     the ``scene`` that was loaded from ``path``, in the place and orientation of its own, turned by ``rotate`` degrees about
     its up axis, and brighter by ``brighten`` stops. Another map stands still, where its own goes round with the camera, as on
-    a turntable, and is at infinity.
+    a turntable, and is at infinity. Diffuse radiance that is ``relightable`` becomes ``lit``.
 
     Raises: UserError for a scene without an environment map, and an image that can't be read.
     """
@@ -36,10 +36,18 @@ def relight(
             integrator.turntable = integrator.room = None
     if brighten:
         params["scale"] = params["scale"] * 2.0**brighten
+    _light_diffuse(scene)
     to_world = np.array(params["to_world"].matrix).reshape(4, 4)
     to_world[:3, :3] = to_world[:3, :3] @ about_vertical(rotate)
     params["to_world"] = mi.Transform4f(mi.ScalarTransform4f(to_world))
     params.update()
+
+
+def _light_diffuse(scene):
+    """Have base colors, where they are known, make the diffuse radiance from now on."""
+    integrator = scene.integrator()
+    if is_deferred(integrator) and integrator.diffuse == "relightable" and integrator.specular != "none":
+        integrator.diffuse = "lit"
 
 
 def about_vertical(degrees: float) -> np.ndarray:
@@ -70,12 +78,14 @@ def load_envmap(envmap: str | Path) -> "mi.Emitter":
 
 
 def edit(scene: "mi.Scene", path: str | Path, changes: Sequence[str]) -> None:
-    """Set or scale materials of the surfels of the ``scene`` that was loaded from ``path``, by `edited`."""
+    """Set or scale materials of the surfels of the ``scene`` that was loaded from ``path``, by `edited`. Diffuse radiance that is
+    ``relightable`` becomes ``lit``."""
     params = mi.traverse(surfels_of(scene, path))
     arrays = {name: params[name].numpy() for name in ("centers", *MATERIAL)}
     for name, values in edited(arrays, changes).items():
         params[name] = as_tensor(values)
     params.update()
+    _light_diffuse(scene)
 
 
 def edited(arrays: Mapping[str, np.ndarray], changes: Iterable[str]) -> dict[str, np.ndarray]:

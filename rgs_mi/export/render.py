@@ -95,7 +95,7 @@ def render_scene(
         if getattr(scene.integrator(), "diffuse", "lit") != "lit":
             print(
                 f"{path}: its diffuse radiance stays as photographed, only reflections change: "
-                "fit with -D diffuse=lit to relight all of it",
+                "fit without -D diffuse=radiance to relight all of it",
                 file=sys.stderr,
             )
     if changes:

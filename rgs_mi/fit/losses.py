@@ -223,6 +223,14 @@ def delta_normal(gbuffer: GBuffer) -> "mi.Float":
     return dr.sum(dr.select(nonzero, dr.sqrt(dr.select(nonzero, length2, 1)), 0)) / (gbuffer.size[0] * gbuffer.size[1])
 
 
+def residual(radiance: "mi.Color3f", lit: "mi.Color3f", shown: "mi.Float") -> "mi.Float":
+    """Return the mean absolute difference of the diffuse ``radiance`` of surfels and of what their base color reflects, ``lit``,
+    both linear, one entry a surfel, which counts by the area that is ``shown`` of it. What of a radiance is light and what is
+    material is left open by photographs; this leaves to neither what the two together can explain."""
+    d = dr.abs(radiance - lit)
+    return dr.sum(shown * (d.x + d.y + d.z)) / (3 * dr.maximum(dr.sum(shown), 1e-12))
+
+
 def pearson_depth(depth: "mi.Float", prior: "mi.Float", valid: "mi.Bool", inverse: bool = False) -> "mi.Float":
     """Return RGS's L_depth: 1 − r, with r Pearson's correlation of the rendered z-depth and a prior's over the ``valid``
     pixels.

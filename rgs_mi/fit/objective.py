@@ -7,12 +7,14 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.bounding_box import BoundingBox
-from ..core.camera import Camera
+from ..core.camera import Camera, opaque
 from ..datasets.photographs import Photograph
 from ..settings.settings import Settings
 from ..shading import deferred
+from ..shading.lighting import Lighting
 from ..splat.gbuffer import GBuffer
 from ..splat.tiles import Cutoffs
+from ..surfels.surfels import Surfels
 from . import losses
 from .reflection_guided import reflective_mask
 
@@ -93,6 +95,21 @@ class Objective:
             depth = maps.depth / dr.select(covered, maps.alpha, 1)
             terms["depth"] = w.depth * losses.pearson_depth(depth, photo.prior, covered, photo.inverse)
         return terms, mask
+
+    def residual(self, surfels: Surfels, lighting: Lighting, camera: Camera) -> "mi.Float":
+        """Return the weighted part of the ``surfels``' diffuse radiance, as ``camera`` sees them, that is not what their base
+        color reflects under ``lighting``; of width 1."""
+        center = dr.detach(surfels.column(mi.Point3f, "centers"))
+        view = dr.normalize(opaque(camera, len(surfels)).origin - center)
+        scales, opacity = surfels.column(mi.Vector2f, "scales"), surfels.column(mi.Float, "opacities")
+        cosine = dr.dot(surfels.frames()[2], view)
+        shown = opacity * scales.x * scales.y * (dr.abs(cosine) if surfels.two_sided else dr.maximum(cosine, 0))
+        if self.box is not None:
+            shown = dr.select(self.box.contains(center), shown, 0)
+        lit = lighting.seen_by(camera, len(surfels)).lit_radiance(surfels, view)
+        return dr.opaque(mi.Float, self.settings.weights.residual) * losses.residual(
+            surfels.radiance(-view), lit, dr.detach(shown)
+        )
 
     def reflective_mask(self, gbuffer: GBuffer, camera: Camera) -> np.ndarray:
         """Return β̂ of a view, [H, W] bool: which pixels are reflective."""

@@ -78,6 +78,13 @@ class Schedule:
         indirect = "none" if specular == "none" or progress < s.indirect_start else final.indirect
         return replace(final, specular=specular, indirect=indirect)
 
+    def explains(self, progress: float) -> bool:
+        """Return whether base colors are held to explain the surfels' own diffuse radiance by then, so that it can be relit: once
+        they reflect each other, as far as the light is not sampled, which has noise."""
+        shading = self.shading(progress)
+        wanted = shading.diffuse == "relightable" and self.settings.weights.residual > 0
+        return wanted and shading.specular == "split_sum" and progress >= self.settings.indirect_start
+
     def value(self, pair: tuple[float, float], progress: float) -> float:
         """Of a (first, last) ``pair``: geometrically between them, linearly from or to zero."""
         first, last = pair

@@ -184,8 +184,10 @@ class Fit:
             self.proxies = self.irradiance_visibility = None
             if shading.indirect != "none":
                 self.proxies = Proxies(surfels, box=shading.box)
-                if shading.diffuse == "lit" and (lighting := self.lighting(surfels, training=True)) and lighting.indirect:
-                    self.irradiance_visibility = lighting.indirect.irradiance_visibility
+                explained = shading.diffuse == "lit" or self.schedule.explains(self.progress)
+                if explained and (lighting := self.lighting(surfels, training=True)):
+                    lighting = lighting if lighting.lit else lighting.with_irradiance_visibility(self.step_number)
+                    self.irradiance_visibility = lighting.indirect and lighting.indirect.irradiance_visibility
 
     # ---- One step ----
 
@@ -254,6 +256,10 @@ class Fit:
         surfels = Surfels(**dict(zip(CHANNELS, leaves)), two_sided=surfels.two_sided)
         lighting = lighting and lighting.with_learned(leaves[len(CHANNELS) :], surfels)
         measured = [self._view(i, surfels, lighting, 1 / len(views)) for i in views]
+        if lighting and self.schedule.explains(self.progress):
+            loss = self.objective.residual(surfels, lighting, self.dataset.train[views[0]].camera)
+            dr.backward(loss)
+            measured.append({"loss.residual": dr.detach(loss)})
         for value, leaf in zip(shared, leaves):
             gradient = dr.grad(leaf)
             dr.set_grad(value, dr.select(dr.isfinite(gradient), gradient, 0))  # one overflow must not end a fit

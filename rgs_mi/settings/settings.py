@@ -127,6 +127,12 @@ class Weights:
         le=1e3,
         description="Total variation of the environment: what nothing reflects sharply stays smooth.",
     )
+    residual: float = Field(
+        default=0.05,
+        ge=0,
+        le=1e3,
+        description="Diffuse radiance that the base color does not explain, where the integrator's `diffuse` is `relightable`.",
+    )
     poses: float = Field(
         default=0.1, ge=0, le=1e6, description="Squared distance of learned poses from the given ones, in radians."
     )

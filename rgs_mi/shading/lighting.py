@@ -31,7 +31,7 @@ class Shading:
     (None: it stands still)."""
 
     specular: Literal["none", "split_sum", "monte_carlo"] = "split_sum"
-    diffuse: Literal["radiance", "lit"] = "radiance"
+    diffuse: Literal["radiance", "relightable", "lit"] = "radiance"
     samples: int = SAMPLES
     eta: float = DEFAULT_ETA
     box: BoundingBox | None = None
@@ -109,19 +109,30 @@ class Lighting:
 
     def _reflected(self, surfels, uv, view, own, irradiance_visibility):
         """`radiance` of surfels in the box, whose diffuse radiance is their ``own`` where they are not lit."""
+        surface = self._surface(surfels, view, uv)
+        diffuse = self.diffuse(surface, irradiance_visibility) if self.lit else own
+        return diffuse + self.specular(surface)
+
+    def _surface(self, surfels, view, uv=None):
+        """What the ``surfels`` are where they are seen, or at their centers."""
         normal = surfels.normals(uv)
         if surfels.two_sided:
             normal = dr.mulsign(normal, dr.dot(view, normal))
-        surface = Surface(
+        point = surfels.column(mi.Point3f, "centers") if uv is None else surfels.points(uv)
+        return Surface(
             normal,
             view,
             surfels.column(mi.Float, "roughness"),
             surfels.column(mi.Float, "metallic"),
             surfels.column(mi.Color3f, "base_color"),
-            surfels.points(uv) if self.near else None,
+            point if self.near else None,
         )
-        diffuse = self.diffuse(surface, irradiance_visibility) if self.lit else own
-        return diffuse + self.specular(surface)
+
+    def lit_radiance(self, surfels: Surfels, view: "mi.Vector3f") -> "mi.Color3f":
+        """Return the diffuse radiance that each of the ``surfels`` would send along its unit ``view``, in world space, if it were
+        lit: what its base color reflects of the light."""
+        visibility = None if self.indirect is None else self.indirect.irradiance_visibility
+        return self.estimator.diffuse(self._surface(surfels, view), None, 1 if visibility is None else visibility)
 
     def _incident_radiance(self, surface) -> IncidentRadiance | None:
         """The callback for a surface; None where it reflects the environment alone."""

@@ -63,6 +63,11 @@ class Look:
         where = "" if self.region is None else "@" + ",".join(f"{v:.6g}" for v in self.region)
         return self.material.changes() + (self.region_material.changes(where) if where else ())
 
+    @property
+    def changed(self) -> bool:
+        """Whether light or materials are others than those of the scene."""
+        return self.light != OWN or bool(self.rotate or self.brighten or self.changes())
+
     def options(self, distance: float, keys: Sequence[Camera] = (), frames: int = 0) -> list[str]:
         """Return what `rgs-mi render` takes behind a scene's name to make the same picture, with 16 samples a pixel, or a film
         of so many ``frames`` through the cameras ``keys``, with 4; they look at points at that ``distance``, world units. What is

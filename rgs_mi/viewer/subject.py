@@ -145,7 +145,7 @@ class Subject:
     @property
     def _settles(self):
         """Whether a picture at rest has another lighting than one in motion."""
-        hidden = self.shading.diffuse == "lit" and self.shading.indirect != "none"
+        hidden = self.shading.diffuse != "radiance" and self.shading.indirect != "none"
         return hidden or self.shading.specular == "monte_carlo"
 
     def _make(self, look, settled):
@@ -154,6 +154,8 @@ class Subject:
             return Lit(surfels, None, None)
         environment = _turned(self.lights[look.light], look)
         shading = replace(self.shading, turntable=self.turntable(look))
+        if shading.diffuse == "relightable" and shading.specular != "none" and look.changed:
+            shading = replace(shading, diffuse="lit")
         sampled, emitter = shading.specular == "monte_carlo" and settled, None
         if shading.indirect != "none" and self.proxies is None:
             self.proxies = Proxies(self.surfels, box=shading.box)

@@ -22,20 +22,24 @@ def draw(subject: Subject, grid: int) -> None:
 
 def warm(subject: Subject, grid: int) -> None:
     """Compile what pictures of ``grid`` × ``grid`` points need, whatever they show: from two places, for what is the same in
-    both is compiled in; with the light behind the object; where no reflected ray meets it; and where it is not seen at all.
+    both is compiled in; with the light behind the object; where no reflected ray meets it; and where it is not seen at all. Under
+    another light what is relightable needs others.
     Of a fit in progress, which changes what it needs, one picture."""
     if subject.changing:
         return draw(subject, grid)
     first, last = subject.cameras[0], subject.cameras[-1]
-    for camera in (first, _behind(subject, first), last, _turned_away(first)):
-        for background in ("white", "light"):
-            measure(subject, Look(camera, background=background), camera.resized(grid, grid), settled=False)
-    lit = subject.lit(Look(first), settled=False)
-    if lit.lighting is not None and lit.lighting.indirect is not None:
-        alone = replace(lit.lighting, indirect=replace(lit.lighting.indirect, kind="visibility"))
-        with dr.suspend_grad():
-            image = deferred.render(lit.surfels, first.resized(grid, grid), alone)
-            dr.eval(image.color, image.diffuse, image.specular)
+    looks = [Look(first)] + [Look(first, rotate=90)] * (subject.shading.diffuse == "relightable")
+    for look in looks:
+        for camera in (first, _behind(subject, first), last, _turned_away(first)):
+            for background in ("white", "light"):
+                seen = replace(look, camera=camera, background=background)
+                measure(subject, seen, camera.resized(grid, grid), settled=False)
+        lit = subject.lit(look, settled=False)
+        if lit.lighting is not None and lit.lighting.indirect is not None:
+            alone = replace(lit.lighting, indirect=replace(lit.lighting.indirect, kind="visibility"))
+            with dr.suspend_grad():
+                image = deferred.render(lit.surfels, first.resized(grid, grid), alone)
+                dr.eval(image.color, image.diffuse, image.specular)
 
 
 def _behind(subject, camera):

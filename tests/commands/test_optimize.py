@@ -86,7 +86,8 @@ def test_indirect_light_is_exported(inputs, tmp_path):
     [
         ('type="rgs_deferred">', 'type="rgs_deferred"><string name="specular" value="none"/>'),
         ('type="rgs_deferred">', 'type="rgs_deferred"><string name="specular" value="monte_carlo"/>'),
-        ('<default name="diffuse" value="radiance"/>', '<default name="diffuse" value="lit"/>'),
+        ('<default name="diffuse" value="relightable"/>', '<default name="diffuse" value="lit"/>'),
+        ('<default name="diffuse" value="relightable"/>', '<default name="diffuse" value="radiance"/>'),
         ('<bsdf type="principled" id="material"/>', '<bsdf type="principled"><float name="eta" value="2.5"/></bsdf>'),
     ],
 )

@@ -290,6 +290,21 @@ def environment_total_variation_twin(x):
     return total * polar * azimuthal / (4 * np.pi)
 
 
+def test_residual_equals_numpy():
+    rng = np.random.default_rng(0)
+    radiance, lit, shown = rng.uniform(0, 1, (3, 50)), rng.uniform(0, 1, (3, 50)), rng.uniform(0, 2, 50)
+    radiance[:, :5] = lit[:, :5]  # explained
+    own = mi.Color3f(*map(aligned, radiance))
+    dr.enable_grad(own)
+    loss = losses.residual(own, mi.Color3f(*map(aligned, lit)), aligned(shown))
+    dr.backward(loss)
+    weights = shown / shown.sum()
+    assert np.isclose(loss[0], (weights * abs(radiance - lit).mean(0)).sum(), rtol=1e-5)
+    assert np.allclose(dr.grad(own).numpy(), weights * np.sign(radiance - lit) / 3, atol=1e-7)
+    nothing = losses.residual(own, own, dr.zeros(mi.Float, 50))
+    assert nothing[0] == 0
+
+
 def test_environment_total_variation_and_its_gradient():
     x = np.random.default_rng(5).normal(size=(5, 8, 3))
     leaf = mi.TensorXf(x.astype(np.float32))

@@ -1,0 +1,119 @@
+"""Base colors that explain a radiance: of a matte ball under a light that is known."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from rgs_mi.core.color import to_8bit
+from rgs_mi.datasets.types import Dataset, View
+from rgs_mi.fit import losses
+from rgs_mi.fit.model import Model
+from rgs_mi.fit.objective import Objective
+from rgs_mi.fit.trainer import Fit
+from rgs_mi.settings.settings import LearningRates
+from rgs_mi.shading import deferred
+from rgs_mi.shading.environment import Environment
+from rgs_mi.shading.lighting import Lighting, Shading
+from rgs_mi.shading.split_sum import SplitSum
+from rgs_mi.surfels.surfels import Surfels
+
+from fits import SETTINGS
+from scenes import orbit_camera, tangent_surfels
+
+COUNT = 300
+
+
+def light():
+    """Bright from one side, of another colour from the other; [16, 32, 3]."""
+    azimuth = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+    part = (0.5 + 0.5 * np.cos(azimuth))[None, :, None]
+    return np.broadcast_to(0.1 + part * [1.1, 0.9, 0.6] + (1 - part) * [0.05, 0.1, 0.3], (16, 32, 3)).copy()
+
+
+def matte() -> Surfels:
+    """A ball of four colours, whose own radiance is a grey."""
+    fields = tangent_surfels(COUNT).numpy()
+    sectors = np.int32(np.floor((np.arctan2(*fields["centers"][:, 1::-1].T) + np.pi) / np.pi * 2)) % 4
+    colors = np.array([[0.8, 0.2, 0.2], [0.2, 0.7, 0.3], [0.3, 0.3, 0.8], [0.7, 0.7, 0.2]])[sectors]
+    materials = {"base_color": colors, "metallic": np.zeros((COUNT, 1)), "roughness": np.full((COUNT, 1), 0.6)}
+    return Surfels.from_numpy(fields | materials, two_sided=False)
+
+
+def photographs(truth) -> Dataset:
+    """Six views of the ball, lit."""
+    lighting = Lighting(SplitSum(Environment(mi.TensorXf(np.float32(light())), np.eye(3)).filtered()), lit=True)
+    views = []
+    for k in range(6):
+        camera = orbit_camera(k, size=(72, 64))
+        image = deferred.render(truth, camera, lighting)
+        alpha = np.clip(image.gbuffer.all.alpha.numpy(), 0, 1).reshape(64, 72, 1)
+        shown = losses.display(image.color, image.gbuffer.all.alpha, 0.0).numpy().T.reshape(64, 72, 3)
+        pixels = to_8bit(np.concatenate([np.clip(shown / np.maximum(alpha, 1e-3), 0, 1), alpha], 2))
+        views.append(View(f"r_{k}", camera, pixels, True, None, Path(f"r_{k}.png")))
+    return Dataset(views, [])
+
+
+def fitted(diffuse) -> tuple[Fit, Surfels]:
+    """A fit of colours and radiance alone: all else is as it should be."""
+    truth = matte()
+    centers = truth.numpy()["centers"]
+    scale = float(truth.numpy()["scales"].mean())
+    spacing, grey = np.full(COUNT, scale), np.full((COUNT, 3), 0.3)
+    model = Model.start(centers, centers, grey, spacing, light(), np.eye(3), 1, opacity=0.8, roughness=0.6)
+    model.set("rotations", truth.numpy()["rotations"])
+    model.set("logit_metallic", np.full((COUNT, 1), -7.0))
+    held = (
+        "centers",
+        "rotations",
+        "scales",
+        "opacities",
+        "delta_normal",
+        "curvature",
+        "environment",
+        "roughness",
+        "metallic",
+    )
+    rates = replace(LearningRates(), sh_dc=(0.2, 0.02), **{name: (0.0, 0.0) for name in held})
+    settings = replace(SETTINGS, iterations=120, indirect_start=0.0, learning_rates=rates)
+    fit = Fit(photographs(truth), model, settings, 1.0, Shading(diffuse=diffuse))
+    while fit.progress < 1:
+        fit.step()
+    return fit, truth
+
+
+def test_base_colors_are_found_beside_the_radiance():
+    """Of what photographs show nothing changes, and what was grey is the true colour."""
+    errors, psnr = {}, {}
+    for diffuse in ("radiance", "relightable"):
+        fit, truth = fitted(diffuse)
+        seen = abs(truth.numpy()["centers"][:, 2]) < 0.6
+        errors[diffuse] = abs(fit.model.surfels(1).base_color.numpy() - truth.numpy()["base_color"])[seen].mean()
+        psnr[diffuse] = fit.psnr
+    assert errors["relightable"] < 0.04 < 0.15 < errors["radiance"]
+    assert min(psnr.values()) > 45
+
+
+def test_the_residual_and_its_gradient():
+    """None where radiance is what base colors reflect; else as finite differences say."""
+    surfels = matte()
+    lighting = Lighting(SplitSum(Environment(mi.TensorXf(np.float32(light())), np.eye(3)).filtered()))
+    camera, objective = orbit_camera(0.4, size=(72, 64)), Objective(SETTINGS, 1.0)
+    weight = SETTINGS.weights.residual
+
+    def loss(colors):
+        changed = replace(surfels, base_color=mi.TensorXf(np.float32(colors)))
+        dr.enable_grad(changed.base_color)
+        value = objective.residual(changed, lighting, camera)
+        dr.backward(value)
+        return float(value[0]), dr.grad(changed.base_color).numpy()
+
+    colors = surfels.numpy()["base_color"]
+    value, gradient = loss(colors)
+    facing = (surfels.numpy()["centers"] @ camera.origin) > 1.2  # well within what is seen
+    step = np.where(facing[:, None], 3e-3 * np.sign(gradient), 0)
+    difference = (loss(colors + step)[0] - loss(colors - step)[0]) / 2
+    assert value > 0.05 * weight and abs((gradient * step).sum() / difference - 1) < 0.03
+    assert abs(gradient[facing]).max() > 0 and (gradient[(surfels.numpy()["centers"] @ camera.origin) < 0.9] == 0).all()
