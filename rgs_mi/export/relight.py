@@ -36,7 +36,8 @@ def relight(
             integrator.turntable = integrator.room = None
     if brighten:
         params["scale"] = params["scale"] * 2.0**brighten
-    _light_diffuse(scene)
+    if envmap is not None or rotate or brighten:
+        _light_diffuse(scene)
     to_world = np.array(params["to_world"].matrix).reshape(4, 4)
     to_world[:3, :3] = to_world[:3, :3] @ about_vertical(rotate)
     params["to_world"] = mi.Transform4f(mi.ScalarTransform4f(to_world))

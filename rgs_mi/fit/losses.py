@@ -225,8 +225,11 @@ def delta_normal(gbuffer: GBuffer) -> "mi.Float":
 
 def residual(radiance: "mi.Color3f", lit: "mi.Color3f", shown: "mi.Float") -> "mi.Float":
     """Return the mean absolute difference of the diffuse ``radiance`` of surfels and of what their base color reflects, ``lit``,
-    both linear, one entry a surfel, which counts by the area that is ``shown`` of it. What of a radiance is light and what is
-    material is left open by photographs; this leaves to neither what the two together can explain."""
+    both linear, one entry a surfel, which counts by the area that is ``shown`` of it:
+
+        Σ a |C_d − C_d^lit| / Σ a                                                                   (16)
+
+    Photographs leave open what of a radiance is light and what is material; (16) leaves to neither what both can explain."""
     d = dr.abs(radiance - lit)
     return dr.sum(shown * (d.x + d.y + d.z)) / (3 * dr.maximum(dr.sum(shown), 1e-12))
 

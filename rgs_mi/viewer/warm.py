@@ -22,15 +22,15 @@ def draw(subject: Subject, grid: int) -> None:
 
 def warm(subject: Subject, grid: int) -> None:
     """Compile what pictures of ``grid`` × ``grid`` points need, whatever they show: from two places, for what is the same in
-    both is compiled in; with the light behind the object; where no reflected ray meets it; and where it is not seen at all. Under
-    another light what is relightable needs others.
-    Of a fit in progress, which changes what it needs, one picture."""
+    both is compiled in; with the light behind the object; where no reflected ray meets it; where nothing else is seen, and where
+    it is not seen at all. Under another light what is relightable needs others. Of a fit in progress, which changes what it
+    needs, one picture."""
     if subject.changing:
         return draw(subject, grid)
     first, last = subject.cameras[0], subject.cameras[-1]
     looks = [Look(first)] + [Look(first, rotate=90)] * (subject.shading.diffuse == "relightable")
     for look in looks:
-        for camera in (first, _behind(subject, first), last, _turned_away(first)):
+        for camera in (first, _behind(subject, first), last, _turned_away(first), _close(subject, first, grid)):
             for background in ("white", "light"):
                 seen = replace(look, camera=camera, background=background)
                 measure(subject, seen, camera.resized(grid, grid), settled=False)
@@ -50,6 +50,14 @@ def _behind(subject, camera):
     pose = around @ to_world @ np.linalg.inv(around) @ camera.to_world
     pose[:3, 3] += 0.5 * (pose[:3, 3] - subject.center)
     return replace(camera, to_world=pose)
+
+
+def _close(subject, camera, grid):
+    """The camera that sees but the point of a picture where the object hides most of what is behind it."""
+    camera = camera.resized(grid, grid)
+    alpha = measure(subject, Look(camera, map="alpha"), camera, settled=False)["alpha"][..., 0]
+    row, column = np.unravel_index(alpha.argmax(), alpha.shape)
+    return camera.cropped(int(column), int(row), 1, 1)
 
 
 def _turned_away(camera: Camera) -> Camera:

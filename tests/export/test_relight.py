@@ -141,6 +141,32 @@ def test_another_light_stands_still_where_its_own_goes_round(run, tmp_path):
     assert np.allclose(render(scene), before, atol=1e-4)
 
 
+def test_base_colors_take_over_where_light_or_material_changes(run, tmp_path):
+    """Of a scene that is relightable, not of others: there the surfels' own radiance stays."""
+    text = (run / "scene.xml").read_text()
+
+    def rendered(diffuse, change):
+        path = run / f"{diffuse}.xml"
+        path.write_text(text.replace('name="diffuse" value="lit"', f'name="diffuse" value="{diffuse}"'))
+        scene = load_scene(path, {})
+        change(scene, path)
+        return render(scene)
+
+    changes = [
+        lambda scene, path: relight(scene, path, "kitchen"),
+        lambda scene, path: relight(scene, path, rotate=60),
+        lambda scene, path: relight(scene, path, brighten=1),
+        lambda scene, path: edit(scene, path, ["base_color=0.1,0.9,0.5"]),
+    ]
+    for change in changes:
+        lit, relightable, own = (rendered(diffuse, change) for diffuse in ("lit", "relightable", "radiance"))
+        assert np.allclose(relightable, lit, atol=1e-4) and abs(own - lit).mean() > 1e-3
+    lit, relightable, own = (
+        rendered(d, lambda scene, path: relight(scene, path)) for d in ("lit", "relightable", "radiance")
+    )
+    assert np.allclose(relightable, own, atol=1e-5) and abs(own - lit).mean() > 1e-3
+
+
 def test_edit(run):
     path = run / "scene.xml"
     scene = load_scene(path, {})

@@ -11,7 +11,7 @@ from windows import photographs, write_scene
 def scene_file(tmp_path_factory):
     """A scene of surfels, which no test changes."""
     rgs_mi.set_variant()
-    return write_scene(tmp_path_factory.mktemp("scene"))
+    return write_scene(tmp_path_factory.mktemp("scene"), diffuse="relightable")
 
 
 @pytest.fixture(scope="package")
