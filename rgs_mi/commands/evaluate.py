@@ -12,6 +12,7 @@ import numpy as np
 
 from ..core.camera import Camera
 from ..core.errors import UserError
+from ..core.ownership import owned
 from ..core.scene_files import load_scene, spp_of
 from ..datasets import load_dataset
 from ..evaluation import lpips
@@ -58,12 +59,13 @@ def reevaluate(run: str | Path, data: str | Path | None = None, quiet: bool = Fa
     background, longest = _setting(saved, "background", (0, 1), run), _setting(saved, "resolution", (1, 1 << 16), run)
     folder = data or saved.get("photographs")
     dataset, registration = _photographs(folder, scene, run, int(longest), quiet)
-    mean, scores, rows, _ = results.measure(surfels, lighting, dataset, background, spp_of(scene), run, quiet, registration)
-    if not lpips.installed():
-        _keep_lpips(saved, mean, scores)
-    now = {"photographs": str(dataset.root.resolve()), "evaluated": results.circumstances()}
-    figures = {k: v for k, v in saved.items() if k != "views"} | mean | now | {"views": scores}
-    results.publish(run, figures, curves, rows, Environment.from_emitter(scene.environment()))
+    with owned(run):
+        mean, scores, rows, _ = results.measure(surfels, lighting, dataset, background, spp_of(scene), run, quiet, registration)
+        if not lpips.installed():
+            _keep_lpips(saved, mean, scores)
+        now = {"photographs": str(dataset.root.resolve()), "evaluated": results.circumstances()}
+        figures = {k: v for k, v in saved.items() if k != "views"} | mean | now | {"views": scores}
+        results.publish(run, figures, curves, rows, Environment.from_emitter(scene.environment()))
     return figures
 
 

@@ -136,11 +136,12 @@ def test_goes_on(suite, tmp_path, inside, capsys):
     shutil.copytree(tmp_path / "one" / "baseline", tmp_path / "two" / "baseline")
     assert call(suite, tmp_path, scenes=["two"], variants=["baseline"]) == 0 and len(inside) == 2
     assert [r["scene"] for r in read(tmp_path)["runs"]] == ["one", "one", "two"]  # the tables tell of all that is there
-    with pytest.warns(UserWarning, match="other settings"):
-        call(suite, tmp_path, scenes=["one"], variants=["full"], overrides=[*SMALL, "iterations=2"])
+    call(suite, tmp_path, scenes=["one"], variants=["full"], overrides=[*SMALL, "iterations=2"])
+    assert json.loads((tmp_path / "one" / "full.1" / "metrics.json").read_text()) == metrics
     assert inside[2:] == ["one/full"] and [r["iterations"] for r in read(tmp_path)["runs"]] == [2]
 
-    (tmp_path / "one" / "photographs.sha256").write_text("others")
+    file = tmp_path / "one" / "full" / "metrics.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"digests": {"photographs": "others"}}))
     assert call(suite, tmp_path, **options) == 2 and len(inside) == 3
     assert all("other photographs" in r["error"] for r in read(tmp_path)["runs"] if r["scene"] == "one")
 

@@ -1,6 +1,7 @@
 """The command line: what a run leaves behind, going on after a crash, and mistakes that cost one line each."""
 
 import json
+import shutil
 import signal
 
 import mitsuba as mi
@@ -10,6 +11,7 @@ from PIL import Image
 
 from rgs_mi.core.errors import UserError
 from rgs_mi.fit import checkpoint
+from rgs_mi.fit.scene import FitScene
 from rgs_mi.fit.trainer import Fit
 
 from runs import PATIENCE, SMALL, assert_renders_as_written, start_script, wait_for
@@ -175,8 +177,84 @@ def test_resume_after_a_crash(inputs, tmp_path, monkeypatch, capsys):
         fit(*inputs, tmp_path, overrides=[*SMALL, "sh_order=0"], resume=True)
     with pytest.raises(UserError, match="room is None in the checkpoint and can't change"):
         fit(*inputs, tmp_path, overrides=[*SMALL, "room=4"], resume=True)
-    fit(*inputs, tmp_path, overrides=[*SMALL, "iterations=2"])  # a finished run may be overwritten
-    assert metrics(tmp_path)["iterations"] == 2
+
+
+def test_a_finished_run_is_moved_aside(inputs, tmp_path, capsys):
+    out = tmp_path / "run"
+    fit(*inputs, out, overrides=[*SMALL, "iterations=3"])
+    before = {path.relative_to(out): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with pytest.raises(UserError, match="nowhere"):
+        fit(inputs[0], tmp_path / "nowhere", out)
+    assert metrics(out)["iterations"] == 3
+    fit(*inputs, out, overrides=[*SMALL, "iterations=2"])
+    assert metrics(out)["iterations"] == 2
+    assert f"{out} holds a run: it is {tmp_path / 'run.1'} now" in capsys.readouterr().err
+    aside = {p.relative_to(tmp_path / "run.1"): p.read_bytes() for p in (tmp_path / "run.1").rglob("*") if p.is_file()}
+    assert aside == before
+
+    (out / "metrics.json").write_text("{")  # damaged: with its checkpoints it could still be gone on with
+    with pytest.raises(UserError, match="unfinished run"):
+        fit(*inputs, out, overrides=[*SMALL, "iterations=1"])
+
+
+def test_what_is_fitted_is_not_overwritten(inputs, tmp_path):
+    scene, data = inputs
+    (tmp_path / "scene.xml").write_text(scene.read_text())
+    with pytest.raises(UserError, match="holds the scene that is fitted"):
+        fit(tmp_path / "scene.xml", data, tmp_path)
+    (tmp_path / "object.xml").write_text(scene.read_text())
+    (tmp_path / "report.html").touch()
+    with pytest.raises(UserError, match="holds a run, and what it was fitted to"):
+        fit(tmp_path / "object.xml", data, tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["object.xml", "report.html", "scene.xml"]
+
+
+def test_only_to_the_same_photographs_and_by_the_same_format(inputs, tmp_path):
+    """NeRF Synthetic's scenes have the same names and sizes: what they show tells them apart."""
+    scene, data = inputs
+    other = tmp_path / "data"
+    shutil.copytree(data, other)
+    shutil.copy(other / "train" / "r_0.png", other / "train" / "r_1.png")
+    run = fit(scene, data, tmp_path / "run", overrides=[*SMALL, "iterations=3"])
+    _, meta = checkpoint.load_latest(run)
+    assert meta["digests"] == metrics(run)["digests"] and metrics(run)["format"] == checkpoint.FORMAT
+    with pytest.raises(UserError, match="data: not the photographs of the checkpoint"):
+        fit(scene, other, run, resume=True)
+    arrays, meta = checkpoint.load_latest(run)
+    for wrong, message in (
+        ({"format": checkpoint.FORMAT + 1}, "format 2 of a newer version"),
+        ({"format": None}, "format None of another version"),
+        ({"format": "x" * 99 + "\n"}, "of another version"),
+        ({"digests": None}, "not one of a fit"),
+        ({"settings": 3}, "not one of a fit"),
+        ({"extent": "wide"}, "not one of a fit"),
+    ):
+        checkpoint.save(run, arrays, meta | wrong)
+        with pytest.raises(UserError, match=message):
+            fit(scene, data, run, resume=True)
+    checkpoint.save(run, {}, meta)
+    with pytest.raises(UserError, match="not one of a fit"):
+        fit(scene, data, run, resume=True)
+
+
+def test_two_at_once(inputs, tmp_path):
+    """The second is told whose the folder is, and the first goes on."""
+    command = ["optimize.py", inputs[0], "--data", inputs[1], "--out", tmp_path / "run"]
+    first = start_script(*command, "--set", "initialization.surfels=300", "--set", "iterations=1000000")
+    wait_for(lambda: any((tmp_path / "run" / "checkpoints").glob("step_*.npz")), first)
+    second = start_script(*command, "--resume")
+    out, error = second.communicate(timeout=PATIENCE)
+    assert second.returncode == 2 and error.count("\n") == 1, error
+    assert f"run is in use by process {first.pid} on " in error
+    assert first.poll() is None and any((tmp_path / "run" / "checkpoints").glob("step_*.npz"))
+
+
+def test_a_run_is_called_by_the_name_of_its_photographs(inputs, monkeypatch):
+    scene, data = inputs
+    for given in (data, data / "train" / "..", f"{data}/"):
+        assert FitScene.load(scene, given).name == "ball"
+    monkeypatch.chdir(data / "train")
+    assert FitScene.load(scene, "..").name == "ball" and FitScene.load(scene, "/").name == "object"
 
 
 def test_nothing_to_resume(inputs, tmp_path, capsys):

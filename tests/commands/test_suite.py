@@ -12,6 +12,7 @@ import pytest
 from rgs_mi.commands import jobs, suite
 from rgs_mi.core import subprocesses
 from rgs_mi.core.errors import UserError
+from rgs_mi.fit import checkpoint
 from rgs_mi.report import paper_results, results, tables
 
 from captures import photographs, write_colmap, write_nerfstudio, write_nero
@@ -124,9 +125,23 @@ def test_goes_on(captures, tmp_path, inside, capsys):
     with open(out / "suite.csv", newline="") as stream:
         assert [float(r["psnr"]) for r in csv.DictReader(stream)] == [r["psnr"] for r in first["runs"]]
 
-    with pytest.warns(UserWarning, match="other settings"):
-        call(captures, out, scenes=["car"], overrides=[*SMALL, "iterations=2"])
+    call(captures, out, scenes=["car"], overrides=[*SMALL, "iterations=2"])
     assert inside[2:] == ["car"] and [(r["scene"], r["iterations"]) for r in read(out)["runs"]] == [("car", 2)]
+    assert json.loads((out / "car.1" / "metrics.json").read_text()) == metrics  # what was finished is not lost
+    (out / "car" / "metrics.json").unlink()  # nor is what was begun
+    with pytest.warns(UserWarning, match=r"car had other settings: it is .*car\.2 now"):
+        call(captures, out, scenes=["car"], overrides=[*SMALL, "iterations=3"])
+    assert checkpoint.load_latest(out / "car.2")[1]["step"] == 2
+
+
+@pytest.mark.parametrize("content", ["{", "[1]", '{"finished": true}', '{"finished": true, "settings": 3}', "\xff", "[" * 100000])
+def test_a_damaged_run_ends_no_suite(captures, tmp_path, inside, content):
+    """Its checkpoints are gone on with, or else it is moved aside."""
+    out = tmp_path / "out"
+    call(captures, out, scenes=["helmet"])
+    (out / "helmet" / "metrics.json").write_text(content)
+    assert call(captures, out) == 0 and [r["status"] for r in read(out)["runs"]] == ["finished"] * 2
+    assert call(captures, out) == 0 and inside == ["helmet", "car", "helmet"]
 
 
 def test_failures_are_told(captures, tmp_path, inside, capsys):
@@ -136,7 +151,8 @@ def test_failures_are_told(captures, tmp_path, inside, capsys):
     (root / "car").symlink_to(captures[1] / "car")
     out = tmp_path / "out"
     (out / "car").mkdir(parents=True)
-    (out / "car" / "photographs.sha256").write_text("others")
+    others = {"finished": True, "settings": {}, "digests": {"photographs": "others"}}
+    (out / "car" / "metrics.json").write_text(json.dumps(others))
     assert call((captures[0], root), out) == 2 and inside == []
     rows = read(out)["runs"]
     assert [r["status"] for r in rows] == ["failed"] * 2
@@ -144,7 +160,7 @@ def test_failures_are_told(captures, tmp_path, inside, capsys):
     assert "malformed JSON" in (out / "suite.md").read_text() and "malformed JSON" in (out / "suite.html").read_text()
     assert "bad: " in capsys.readouterr().err
 
-    (out / "car" / "photographs.sha256").unlink()
+    (out / "car" / "metrics.json").unlink()
     assert call((captures[0], root), out) == 1 and inside == ["car"]
     assert [r["status"] for r in read(out)["runs"]] == ["failed", "finished"]
 
