@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..core.errors import UserError
+from ..core.errors import Stopped, UserError
 from ..core.files import atomic_file
 from ..core.ownership import owned
 from ..datasets import is_capture, looked_for
@@ -19,7 +19,6 @@ from ..fit.scene import FitScene
 from ..report import results
 from ..report.tables import DETAILS, FIGURES, csv_text
 from .optimize import optimize
-
 
 # ---- What there is to do ----
 
@@ -108,10 +107,12 @@ def fit(xml: str | Path, job: Job, quiet: bool) -> None:
     if saved and not resume:
         with owned(job.folder) as mine:
             warnings.warn(f"{job.folder} had other settings: it is {mine.move_aside()} now", stacklevel=2)
-    with contextlib.redirect_stdout(io.StringIO()):
-        optimize(xml, data=job.data, config=job.config, overrides=job.overrides, out=job.folder, resume=resume, quiet=quiet)
-    if job.figures() is None:
-        raise UserError("stopped before its end: the same command goes on")
+    options = {"data": job.data, "config": job.config, "overrides": job.overrides, "out": job.folder}
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            optimize(xml, **options, resume=resume, quiet=quiet)
+    except Stopped as stop:
+        raise UserError("stopped before its end: the same command goes on") from stop
 
 
 # ---- What comes out ----

@@ -1,6 +1,7 @@
 """A fit from beginning to end: photographs and scene in, a run's folder out. What `rgs-mi optimize` calls."""
 
 import os
+import signal
 import sys
 import time
 import warnings
@@ -10,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import report
 from ..core.bounding_box import BoundingBox
-from ..core.errors import UserError
+from ..core.errors import Stopped, UserError
 from ..core.interrupt import GracefulInterrupt
 from ..core.ownership import Owned, owned
 from ..core.progress import Progress
@@ -25,7 +27,6 @@ from ..fit.scene import FitScene
 from ..fit.trainer import Fit
 from ..priors import depth_priors
 from ..priors.initialization import initial_points, surroundings
-from .. import report
 from ..report import results
 from ..settings.config import to_dict
 from ..settings.settings import Settings
@@ -62,7 +63,9 @@ def optimize(
       tensorboard: write event files into the folder's ``tensorboard``
       window:  host and port of a page that shows the fit while it goes on (`viewer.live`)
 
-    Raises: UserError for bad input, a package that is missing, a folder that can't be written, and a fit that diverges.
+    Raises: UserError for bad input, a package that is missing, a folder that can't be written, and a fit that diverges;
+    Stopped where someone has stopped it, by a signal or in the window, after everything is saved, and evaluated as well after
+    Ctrl-C, but not after SIGTERM.
     """
     if window:
         server.check(*window)
@@ -89,9 +92,10 @@ def optimize(
         finally:
             for opened in filter(None, (log, watch)):
                 opened.close()
-        results.write(fit, scene, folder, quiet)
+        if stopped in (None, signal.SIGINT):  # what sends other signals does not wait for results
+            results.write(fit, scene, folder, quiet)
     if stopped:
-        print(f"stopped at {100 * fit.progress:.0f}%; go on with the same command and --resume")
+        raise Stopped(stopped, f"stopped at {100 * fit.progress:.0f}%; go on with the same command and --resume")
     return folder
 
 
@@ -260,17 +264,17 @@ def _flat(tree, prefix="") -> dict:
 # ---- Loop ----
 
 
-def _loop(fit, folder, quiet, events=None, watch=None) -> bool:
-    """Step until the budget is spent or someone interrupts, also in a window (``watch``); returns whether someone did. Begins
+def _loop(fit, folder, quiet, events=None, watch=None) -> int | None:
+    """Step until the budget is spent or someone stops it, also in a window (``watch``); returns None, or by which signal. Begins
     and ends with a checkpoint: a folder that can't be written is known before the work, not after it."""
     settings, psnr = fit.settings, None
     checkpoint.save(folder, *_state(fit, folder))
     if fit.progress < 1:
         (folder / results.METRICS).unlink(missing_ok=True)  # from here on the run is unfinished
-    saved = time.monotonic()
+    saved, paused = time.monotonic(), False
     planned = None if settings.iterations else max(0.0, 60 * settings.minutes - fit.elapsed)
     with GracefulInterrupt() as interrupt, Progress(planned, quiet) as progress:
-        while fit.progress < 1 and not interrupt.requested:
+        while fit.progress < 1 and interrupt.signal is None:
             before = fit.elapsed
             recorded = fit.step()
             if not np.isfinite(fit.psnr):
@@ -282,17 +286,29 @@ def _loop(fit, folder, quiet, events=None, watch=None) -> bool:
             if events and recorded:
                 events.add(fit.curves.rows[-1])
             if time.monotonic() - saved > settings.checkpoint_seconds:
-                state = _state(fit, folder)
-                try:
-                    checkpoint.save(folder, *state)
-                except UserError as error:
-                    warnings.warn(f"no checkpoint this time, the fit goes on: {error}", stacklevel=2)
-                saved = time.monotonic()
+                paused, saved = _paused(fit, folder, paused), time.monotonic()
             if watch:
-                watch.between(lambda: interrupt.requested)
-                interrupt.requested |= watch.stopped
-        checkpoint.save(folder, *_state(fit, folder))
-    return interrupt.requested
+                watch.between(lambda: interrupt.signal is not None)
+                if watch.stopped:
+                    interrupt.signal = interrupt.signal or signal.SIGINT
+        _paused(fit, folder, paused)
+    return interrupt.signal
+
+
+def _paused(fit, folder, before) -> bool:
+    """Save a checkpoint; returns whether the disk takes none, which is told once: ``before`` says what was returned last."""
+    state = _state(fit, folder)
+    try:
+        checkpoint.save(folder, *state)
+    except UserError as error:
+        if not before:
+            warnings.warn(
+                f"no checkpoints while it lasts, the last good one stays and the fit goes on: {error}", stacklevel=2
+            )
+        return True
+    if before:
+        print("checkpoints are written again", file=sys.stderr)
+    return False
 
 
 def _state(fit, folder):

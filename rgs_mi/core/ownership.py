@@ -36,14 +36,13 @@ class Owned:
         self.folder = folder
         with explained(folder):
             self._made = not folder.exists()
-            folder.mkdir(parents=True, exist_ok=True)
-            self._descriptor = _acquire(folder / LOCK, wait)
+            self._descriptor = _acquire(_real(folder) / LOCK, wait)
         self._sweep()
 
     def move_aside(self) -> Path:
         """Rename the folder to the first of FOLDER.1, FOLDER.2 … that is free, make an empty one in its place, and return the
         new name of the old one. Raises: UserError where that can't be."""
-        real = Path(os.path.realpath(self.folder))
+        real = _real(self.folder)
         if Path.cwd().is_relative_to(real):
             raise UserError(f"{self.folder} holds a run and is the current folder: choose another --out")
         number = 1
@@ -52,8 +51,7 @@ class Owned:
         with explained(self.folder):
             os.rename(real, aside)
             before = self._descriptor
-            real.mkdir()
-            self._descriptor = _acquire(self.folder / LOCK, wait=False)
+            self._descriptor = _acquire(real / LOCK, wait=False)
         _release(aside / LOCK, before)
         return self.folder.with_name(aside.name) if self.folder.name == real.name else aside
 
@@ -88,10 +86,21 @@ def owned(folder: str | Path, wait: bool = False) -> Iterator[Owned]:
         mine.release()
 
 
+def _real(folder: Path) -> Path:
+    """What links lead to, also where nothing is there yet."""
+    return Path(os.path.realpath(folder))
+
+
 def _acquire(path: Path, wait: bool) -> int | None:
-    """The descriptor of the lock file, locked; None where there are no locks."""
-    while fcntl:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    """The descriptor of the lock file, locked, in a folder that is made where need be; None where there are no locks."""
+    while True:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not fcntl:
+            return None
+        try:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        except FileNotFoundError:  # its owner has just removed the folder, which was empty
+            continue
         try:
             _lock(descriptor, path, wait)
         except BaseException as error:
@@ -107,7 +116,6 @@ def _acquire(path: Path, wait: bool) -> int | None:
             _sign(descriptor)
             return descriptor
         os.close(descriptor)  # its owner has deleted it meanwhile
-    return None
 
 
 def _lock(descriptor, path, wait):

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
 MANIFEST = "truth.json"
+MOST = {"train": 100_000, "test": 100_000, "size": 8192, "spp": 65_536}  # of what a data set is asked for
 FOV = 39.6  # degrees, Blender's default camera (0.691 rad)
 MARGIN = 1.02  # keeps the object's bounding sphere off the frame
 TEST_SPP = 4  # times the samples of a training view: noise in a test view counts against every score
@@ -268,8 +269,10 @@ def render_dataset(
     """
     xml, out, variables = Path(xml), Path(out), dict(variables or {})
     for name, value in {"train": train, "test": test, "size": size, "spp": spp}.items():
-        if value < 1:
-            raise UserError(f"{name} is {value}: needs at least 1")
+        if not 1 <= value <= MOST[name]:
+            raise UserError(f"{name} is {value}: needs at least 1 and at most {MOST[name]}")
+    if radius is not None and not 0 < radius < math.inf:
+        raise UserError(f"radius is {radius:g}: needs a positive distance")
     if not xml.is_file():
         raise UserError(f"no scene at {xml}: check the path")
     key = {

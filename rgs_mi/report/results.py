@@ -16,6 +16,7 @@ import numpy as np
 
 from .. import __version__, report
 from ..core.files import write_json, write_png
+from ..core.inputs import JSON, read_file
 from ..core.progress import Progress
 from ..core.runtime import cores, peak_rss_mb, release_memory
 from ..datasets.types import Dataset, View
@@ -168,7 +169,7 @@ def preview_views(views: Sequence[View]) -> list[View]:
 def saved_figures(folder: Path) -> dict | None:
     """Return what metrics.json in ``folder`` holds; None where it is missing, damaged, or of no run."""
     try:
-        saved = json.loads((folder / METRICS).read_text("utf-8"))
+        saved = json.loads(read_file(folder / METRICS, JSON))
         return saved if isinstance(saved["settings"], dict) and isinstance(saved["finished"], bool) else None
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None

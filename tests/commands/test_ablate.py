@@ -248,7 +248,7 @@ from rgs_mi.core.interrupt import GracefulInterrupt
 def wait(path):
     with GracefulInterrupt() as interrupt:
         path.write_text("waiting")
-        while not interrupt.requested:
+        while interrupt.signal is None:
             time.sleep(0.02)
     path.write_text("saved")
 

@@ -3,6 +3,7 @@
 import json
 import shutil
 import signal
+import subprocess
 
 import mitsuba as mi
 import numpy as np
@@ -14,7 +15,7 @@ from rgs_mi.fit import checkpoint
 from rgs_mi.fit.scene import FitScene
 from rgs_mi.fit.trainer import Fit
 
-from runs import PATIENCE, SMALL, assert_renders_as_written, start_script, wait_for
+from runs import PATIENCE, ROOT, SMALL, assert_renders_as_written, start, start_script, wait_for
 
 SHOWN = ("psnr", "ssim", "lpips", "normal_mae_deg", "surfels", "iterations", "train_seconds", "render_fps", "peak_rss_mb")
 
@@ -247,6 +248,8 @@ def test_two_at_once(inputs, tmp_path):
     assert second.returncode == 2 and error.count("\n") == 1, error
     assert f"run is in use by process {first.pid} on " in error
     assert first.poll() is None and any((tmp_path / "run" / "checkpoints").glob("step_*.npz"))
+    first.kill()
+    first.communicate()
 
 
 def test_a_run_is_called_by_the_name_of_its_photographs(inputs, monkeypatch):
@@ -262,19 +265,27 @@ def test_nothing_to_resume(inputs, tmp_path, capsys):
     assert "from the beginning" in capsys.readouterr().err
 
 
-def test_full_disk_does_not_end_the_fit(inputs, tmp_path, monkeypatch):
-    save, calls = checkpoint.save, []
+def test_full_disk_does_not_end_the_fit(inputs, tmp_path, monkeypatch, capsys):
+    """Neither in its middle nor at its end, and it is told once; the last good checkpoint stays."""
+    save, calls, full = checkpoint.save, [], []
 
-    def full_at_third(*arguments):
-        calls.append(1)
-        if len(calls) == 3:
+    def full_for_a_while(*arguments):
+        calls.append(arguments[2]["step"])
+        if calls[-1] in full:
             raise UserError("no space")
         return save(*arguments)
 
-    monkeypatch.setattr(checkpoint, "save", full_at_third)
-    with pytest.warns(UserWarning, match="no space"):
-        fit(*inputs, tmp_path)
-    assert metrics(tmp_path)["iterations"] == 20
+    monkeypatch.setattr(checkpoint, "save", full_for_a_while)
+    full += range(3, 8)
+    with pytest.warns(UserWarning, match="no space") as told:
+        fit(*inputs, tmp_path / "middle")
+    assert len(told) == 1 and capsys.readouterr().err == "checkpoints are written again\n"
+    assert calls[3:9] == [3, 4, 5, 6, 7, 8] and checkpoint.load_latest(tmp_path / "middle")[1]["step"] == 20
+    full += range(8, 100)
+    with pytest.warns(UserWarning, match="no space") as told:
+        fit(*inputs, tmp_path / "end")
+    assert len(told) == 1 and checkpoint.load_latest(tmp_path / "end")[1]["step"] == 2
+    assert [metrics(tmp_path / name)["iterations"] for name in ("middle", "end")] == [20, 20]
 
 
 @pytest.mark.parametrize("failures", [1, 9, 10])
@@ -323,30 +334,42 @@ def test_no_test_views(inputs, tmp_path):
     assert (tmp_path / "run" / "contact_sheet.png").is_file()
 
 
-def test_interrupt(inputs, tmp_path):
-    scene, data = inputs
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_stopped(inputs, tmp_path, number):
+    """Ctrl-C saves and evaluates; what sends SIGTERM kills soon after, so that there is no more than saving. Each has its code,
+    and the same command goes on."""
+    command = ["optimize.py", inputs[0], "--data", inputs[1], "--out", tmp_path / "run"]
     process = start_script(
-        "optimize.py",
-        scene,
-        "--data",
-        data,
-        "--out",
-        tmp_path,
-        "--set",
-        "iterations=1000000",
-        "--set",
-        "initialization.surfels=300",
-        "--set",
-        "checkpoint_seconds=0",
+        *command, "--set", "iterations=1000000", "--set", "initialization.surfels=300", "--set", "checkpoint_seconds=0"
     )
-    wait_for(lambda: any((tmp_path / "checkpoints").glob("step_*[1-9].npz")), process)
-    process.send_signal(signal.SIGINT)
+    wait_for(lambda: any((tmp_path / "run" / "checkpoints").glob("step_*[1-9].npz")), process)
+    process.send_signal(number)
     out, error = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0, error
-    assert "--resume" in out and "Traceback" not in error
-    figures = metrics(tmp_path)
-    assert not figures["finished"]
-    assert checkpoint.load_latest(tmp_path)[1]["step"] == figures["iterations"] > 0
+    assert process.returncode == 128 + number and "Traceback" not in error, error
+    assert error.splitlines()[-1] == "stopped at 0%; go on with the same command and --resume"
+    assert (tmp_path / "run" / "metrics.json").exists() == (number == signal.SIGINT)
+    assert not (tmp_path / "run" / ".lock").exists()
+    step = checkpoint.load_latest(tmp_path / "run")[1]["step"]
+    assert step > 0
+    if number == signal.SIGINT:
+        figures = metrics(tmp_path / "run")
+        assert not figures["finished"] and figures["iterations"] == step
+
+
+def test_telling_does_not_end_it(inputs, tmp_path):
+    """A full disk below 2> run.log and > run.txt, and a reader that is gone: the fit goes on, and ends well."""
+    command = [ROOT / "scripts" / "optimize.py", inputs[0], "--data", inputs[1], "--set", "iterations=3"]
+    command += ["--set", "initialization.surfels=300", "--set", "learning_rates.room=[0,0]"]
+    with open("/dev/full", "w") as full:
+        process = start(*command, "--out", tmp_path / "full", stdout=full, stderr=full)
+    gone = start(*command, "--out", tmp_path / "gone", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    for stream in (gone.stdout, gone.stderr):
+        stream.close()
+    for name, ended in (("full", process), ("gone", gone)):
+        assert ended.wait(timeout=PATIENCE) == 0 and metrics(tmp_path / name)["finished"]
+    with open("/dev/full", "w") as full:
+        process = start(*command, "--set", "iterations=none", stdout=full, stderr=full)
+    assert process.wait(timeout=PATIENCE) == 2
 
 
 def test_mistakes(inputs, tmp_path):
