@@ -7,7 +7,8 @@ Campaigns, all of them unless some are named; N trials each (default 200, some h
     kill    SIGKILL at a random moment of a whole run, from path tracing to its report; then --resume until it has ended
     term    the same with SIGTERM, which has two seconds to save in
     over    SIGKILL at a random moment of a second run in the folder of a finished one
-    fault   ENOSPC or EIO from each call in turn by which a whole run writes: open, write, fsync, rename (all, or N spread)
+    fault   ENOSPC or EIO from each call in turn by which a whole run writes: of every file open, the first write, fsync, rename,
+            and fsync of its folder (all, or N spread)
     two     two runs that start in one folder at the same time
     poison  NaN in gradients, surfels, environment or photographs at a random step
 
@@ -243,10 +244,14 @@ def faults(at: int | None, code: int):
         return call
 
     class Stream:
-        """The file that is written, whose every write counts."""
+        """The file that is written, whose first write counts."""
 
         def __init__(self, stream):
-            self._stream, self.write = stream, counted(stream.write)
+            self._stream, self._first = stream, counted(stream.write)
+
+        def write(self, content):
+            write, self._first = self._first, self._stream.write
+            return write(content)
 
         def __getattr__(self, name):
             return getattr(self._stream, name)
@@ -278,8 +283,14 @@ def fault(root, number, undisturbed):
     hold(count[0] > at, f"only {count[0]} writes")
     whole(root / "runs")
     hold(not isinstance(result, Exception) or "can't be written" in str(result), str(result))
-    hold(not isinstance(inside(run), Exception), "the next run fails")
+    follow(run)
     hold(abs(run.psnr() - undisturbed["psnr"]) < TOLERANCE, f"{run.psnr():.2f} dB")
+
+
+def follow(run):
+    """The next run goes on to the end."""
+    result = inside(run)
+    hold(not isinstance(result, Exception), f"the next run fails: {result}")
 
 
 def poison(root, number, undisturbed):
@@ -323,7 +334,7 @@ def poison(root, number, undisturbed):
         hold("diverged" in str(result), str(result))
         arrays, _ = checkpoint.load_latest(run.out)
         hold(all(np.isfinite(array).all() for array in arrays.values()), "the checkpoint is not finite")
-        hold(not isinstance(inside(run), Exception), "the next run fails")
+        follow(run)
     hold(np.isfinite(run.psnr()), f"{run.psnr()} dB")
     whole(root / "runs")
 

@@ -228,13 +228,14 @@ def _prepare(out: Path, key: dict):
     """Make ``out`` ready for the rest of the data set with the given key: views with another are deleted."""
     manifest = out / MANIFEST
     if manifest.is_file() and json.loads(manifest.read_text())["key"] != key:
+        write_json(manifest, {"key": None, "complete": False})  # of neither, until the other's views are gone
         for split in ("train", "test"):
             (out / f"transforms_{split}.json").unlink(missing_ok=True)
             for file in [*(out / split).glob("r_*"), *(out / split).glob(".r_*")]:
                 file.unlink()
+    write_json(manifest, {"key": key, "complete": False})  # first: it says whose the folder is
     for split in ("train", "test"):
         make_folder(out / split)
-    write_json(manifest, {"key": key, "complete": False})
 
 
 def _frame(split: str, index: int, camera: Camera) -> dict:

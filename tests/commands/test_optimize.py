@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rgs_mi import report
 from rgs_mi.core.errors import UserError
 from rgs_mi.fit import checkpoint
 from rgs_mi.fit.scene import FitScene
@@ -321,6 +322,16 @@ def test_numbers_that_are_not_finite_do_not_replace_a_checkpoint(inputs, tmp_pat
     with pytest.raises(UserError, match="diverged at step 5"):
         fit(*inputs, tmp_path)
     assert checkpoint.load_latest(tmp_path)[1]["step"] == 4
+
+
+def test_a_run_has_not_ended_before_its_page_is_there(inputs, tmp_path, monkeypatch):
+    def full(*_):
+        raise UserError("no space")
+
+    monkeypatch.setattr(report, "write", full)
+    with pytest.raises(UserError, match="no space"):
+        fit(*inputs, tmp_path, overrides=[*SMALL, "iterations=1"])
+    assert not (tmp_path / "metrics.json").exists()
 
 
 def test_no_test_views(inputs, tmp_path):

@@ -1,10 +1,13 @@
 """Suites: which scenes there are, what is fitted, workers, failures, and the paper's tables."""
 
 import csv
+import gc
 import json
 import os
 import signal
+import struct
 import time
+from multiprocessing.connection import Connection
 
 import drjit as dr
 import pytest
@@ -221,6 +224,19 @@ def test_workers(monkeypatch):
 
 
 # ---- Tables ----
+
+
+def half_a_word():
+    """Die in the middle of sending what came out."""
+    for found in gc.get_objects():
+        if isinstance(found, Connection) and not found.closed and found.writable:
+            os.write(found.fileno(), struct.pack("!i", 1000) + b"half")
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_worker_that_dies_in_the_middle_of_a_word():
+    with pytest.raises(UserError, match="killed by SIGKILL, perhaps for want of memory"):
+        subprocesses.apart(half_a_word)
 
 
 def test_data_sets_by_name():

@@ -17,7 +17,17 @@ from rgs_mi.core.inputs import check_file, is_file, opened, read_file
 from rgs_mi.datasets import frames, load_dataset, path_traced
 from rgs_mi.datasets.images import read_image
 
-from captures import photographs, save, write_blender, write_cloud, write_colmap, write_exr, write_llff, write_nerfstudio, write_nero
+from captures import (
+    photographs,
+    save,
+    write_blender,
+    write_cloud,
+    write_colmap,
+    write_exr,
+    write_llff,
+    write_nerfstudio,
+    write_nero,
+)
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="pipes")
 
@@ -86,7 +96,9 @@ def test_what_is_no_file(tmp_path, name, kind):
         with pytest.warns(UserWarning, match="no image file|not there"):
             assert load_dataset(root).train
     else:
-        refused(lambda: load_dataset(root), "no layout" if name == "cameras" else "a folder" if kind == "folder" else "a pipe")
+        refused(
+            lambda: load_dataset(root), "no layout" if name == "cameras" else "a folder" if kind == "folder" else "a pipe"
+        )
 
 
 @pytest.mark.parametrize("write", [write_blender, write_nerfstudio, write_colmap, write_llff, write_nero])
