@@ -6,9 +6,12 @@ import sys
 import pytest
 
 from rgs_mi import cli
+from rgs_mi.commands.capture import capture
 from rgs_mi.core.errors import UserError
 from rgs_mi.core.scene_files import bundled, find_scene, load_scene
+from rgs_mi.datasets import load_dataset
 from rgs_mi.datasets.path_traced import render_dataset
+from rgs_mi.export.relight import load_envmap
 from rgs_mi.export.render import render_scene
 from rgs_mi.settings.fields import walk
 from rgs_mi.settings.settings import Settings
@@ -119,6 +122,19 @@ def test_data_sets_of_no_size(tmp_path, options, message):
     with pytest.raises(UserError, match=message):
         render_dataset(bundled("targets")["ball"], tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["a" * 300, "a/" + "b" * 300 + ".xml", "a\0b", "\n"])
+def test_names_that_no_file_system_takes(name):
+    for call in (
+        lambda: load_scene(find_scene(name, "scenes"), {}),
+        lambda: load_dataset(name),
+        lambda: load_envmap(name),
+        lambda: render_dataset(name, "out"),
+        lambda: capture(name, "out"),
+    ):
+        with pytest.raises(UserError, match="^(no |data folder|'.*does not exist)"):
+            call()
 
 
 @pytest.mark.parametrize("where", ["plugins/evil.so", "named/plugins/evil.dylib"])

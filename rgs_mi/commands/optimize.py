@@ -130,7 +130,7 @@ def _saved(folder, resume):
 
 def _make_room(mine: Owned, scene):
     """Move a run that is in the folder aside, and say so. Raises: UserError where that can't be."""
-    if not any((mine.folder / name).exists() for name in (results.METRICS, report.REPORT, "checkpoints")):
+    if not any((mine.folder / name).exists() for name in (results.METRICS, report.REPORT)):
         return
     if any(Path(os.path.realpath(p)).is_relative_to(os.path.realpath(mine.folder)) for p in (scene.path, scene.photographs)):
         raise UserError(f"{mine.folder} holds a run, and what it was fitted to: choose another --out")

@@ -9,6 +9,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from .errors import UserError
+from .inputs import is_file
 
 _PACKAGE = Path(__file__).parents[1]
 
@@ -27,7 +28,7 @@ def find_scene(name: str, kind: str) -> Path:
     Raises: UserError for a bare name that is neither.
     """
     path, known = Path(name), bundled(kind)
-    if path.exists() or path.suffix or len(path.parts) > 1:
+    if os.path.exists(path) or path.suffix or len(path.parts) > 1:
         return path
     if name not in known:
         raise UserError(f"no file or folder '{name}' here, and no scene of that name: choose one of {', '.join(known)}")
@@ -39,7 +40,7 @@ def load_scene(path: str | Path, variables: Mapping[str, object]) -> "mi.Scene":
 
     Raises: UserError, in one line, for whatever is wrong with the scene.
     """
-    if not Path(path).is_file():
+    if not is_file(path):
         raise UserError(f"no scene at {path}: check the path")
     _check_no_code(Path(path))
     try:

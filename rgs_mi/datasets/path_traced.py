@@ -30,6 +30,7 @@ from ..core.camera import Camera, opaque, pixel_directions
 from ..core.color import srgb_encode, to_8bit
 from ..core.errors import UserError
 from ..core.files import make_folder, write_bitmap, write_json
+from ..core.inputs import is_file
 from ..core.ownership import LOCK, owned
 from ..core.progress import Progress
 from ..core.scene_files import load_scene
@@ -274,7 +275,7 @@ def render_dataset(
             raise UserError(f"{name} is {value}: needs at least 1 and at most {MOST[name]}")
     if radius is not None and not 0 < radius < math.inf:
         raise UserError(f"radius is {radius:g}: needs a positive distance")
-    if not xml.is_file():
+    if not is_file(xml):
         raise UserError(f"no scene at {xml}: check the path")
     key = {
         "scene": _digest(xml.resolve(), set()),
