@@ -158,5 +158,6 @@ def _is_at(descriptor, path) -> bool:
 def _release(path, descriptor):
     if descriptor is not None:
         with suppress(OSError):
-            path.unlink()  # first: who has opened it meanwhile sees that it is gone
+            if _is_at(descriptor, path):  # else it is another's
+                path.unlink()  # first: who has opened it meanwhile sees that it is gone
         os.close(descriptor)

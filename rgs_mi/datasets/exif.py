@@ -56,11 +56,12 @@ def log_gains(paths: Sequence[Path]) -> np.ndarray:
 
 
 def orientation(path: Path) -> int:
-    """Return how EXIF says that a photograph lies: 1 upright, or where it does not tell; the others are turned or mirrored."""
+    """Return how the EXIF of a JPEG says that it lies: 1 upright, or where it does not tell; the others are turned or mirrored.
+    PNGs are not asked: Pillow would decode all of one."""
     from PIL import Image
 
     try:
-        with opened(path) as stream, Image.open(stream, formats=("PNG", "JPEG")) as image:
+        with opened(path) as stream, Image.open(stream, formats=("JPEG",)) as image:
             return int(image.getexif().get(ORIENTATION, 1)) or 1
     except Exception:  # as in `log_gains`
         return 1

@@ -114,6 +114,25 @@ def test_moved_aside(tmp_path, monkeypatch):
         mine.move_aside()
 
 
+def test_who_comes_between_has_it(tmp_path, monkeypatch):
+    """Another process takes the folder while what was there is moved aside: it stays the other's."""
+    rename = os.rename
+
+    def rename_and_lose(source, target):
+        rename(source, target)
+        monkeypatch.undo()
+        others.append(holder(tmp_path / "run"))
+
+    others = []
+    with pytest.raises(UserError, match="in use by process"), owned(tmp_path / "run") as mine:
+        monkeypatch.setattr(os, "rename", rename_and_lose)
+        mine.move_aside()
+    with pytest.raises(UserError, match="in use by process"), owned(tmp_path / "run"):
+        pass
+    others[0].kill()
+    others[0].wait()
+
+
 def test_halves_of_files_are_swept(tmp_path):
     (tmp_path / "test").mkdir()
     kept = {".a.tmp", "b.tmp", ".c.1234.tmp"}
