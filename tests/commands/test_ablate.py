@@ -15,6 +15,7 @@ from PIL import Image
 from rgs_mi.commands import ablate, jobs
 from rgs_mi.core import subprocesses
 from rgs_mi.core.errors import UserError
+from rgs_mi.fit import checkpoint
 from rgs_mi.fit.scene import FitScene
 from rgs_mi.report import results, tables
 
@@ -194,7 +195,7 @@ def test_stopped_and_gone_on(suite, tmp_path, monkeypatch):
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130 and "same command goes on" in error and "Traceback" not in error, error
-    reached = json.loads((run / results.METRICS).read_text())["iterations"]
+    reached = checkpoint.load_latest(run)[1]["step"]
     assert reached > 0 and read(tmp_path / "out")["runs"][0]["status"] == "missing"
 
     # as if the plan had been to end soon after that
@@ -207,8 +208,6 @@ def test_stopped_and_gone_on(suite, tmp_path, monkeypatch):
 
 def retold(path, **changes):
     """Change the settings in a checkpoint."""
-    from rgs_mi.fit import checkpoint
-
     arrays, meta = checkpoint._load(path)
     meta["settings"] |= changes
     checkpoint.save(path.parents[1], arrays, meta)
