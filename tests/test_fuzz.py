@@ -65,7 +65,6 @@ def write_all(root: Path) -> list:
     """(loader, files it reads) of small captures and other files below ``root``."""
     import mitsuba as mi  # after rgs_mi
 
-
     def folder(name):
         (root / name).mkdir()
         return root / name

@@ -219,7 +219,7 @@ def test_round_trip(tmp_path):
         (npz(weights_2=np.full((3, 12), "a")), "'weights_2' is <U1"),
         (npz(weights_0=np.full((12, 6), np.nan)), "'weights_0' is not finite"),
         (npz(weights_0=np.zeros((12, 6)), more=np.zeros(1 << 14)), "can't be read .*65536 are the most"),
-        (npz(np.savez_compressed, weights_0=np.zeros((12, 6)), more=np.zeros(1 << 17)), "is no shader"),  # which unpacks to anything
+        (npz(np.savez_compressed, weights_0=np.zeros((12, 6)), more=np.zeros(1 << 17)), "is no shader"),
     ],
 )
 def test_malformed_files(tmp_path, content, message):
