@@ -6,8 +6,13 @@ import sys
 import pytest
 
 from rgs_mi import cli
+from rgs_mi.commands.capture import capture
 from rgs_mi.core.errors import UserError
-from rgs_mi.core.scene_files import bundled, find_scene
+from rgs_mi.core.scene_files import bundled, find_scene, load_scene
+from rgs_mi.datasets import load_dataset
+from rgs_mi.datasets.path_traced import render_dataset
+from rgs_mi.export.relight import load_envmap
+from rgs_mi.export.render import render_scene
 from rgs_mi.settings.fields import walk
 from rgs_mi.settings.settings import Settings
 
@@ -85,3 +90,58 @@ def test_names_and_paths(tmp_path, monkeypatch):
     assert find_scene("helmet", "targets").as_posix() == "helmet"
     with pytest.raises(UserError, match="choose one of"):
         find_scene("cat", "targets")
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"size": -5}, "--size -5: needs 1 to 16384"),
+        ({"size": 0}, "--size 0: needs"),
+        ({"size": (5, 0)}, "--size 5x0: needs"),
+        ({"size": 10**6}, "--size 1000000: needs"),
+        ({"spp": -1}, "--spp -1: needs 1 to"),
+    ],
+)
+def test_renderings_of_no_size(options, message):
+    with pytest.raises(UserError, match=message):
+        render_scene(bundled("scenes")["object"], **options)
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"size": -5}, "size is -5: needs at least 1"),
+        ({"size": 10**6}, "size is 1000000: needs at least 1 and at most 8192"),
+        ({"spp": -1}, "spp is -1"),
+        ({"train": 0}, "train is 0"),
+        ({"radius": float("nan")}, "radius is nan: needs a positive distance"),
+        ({"radius": -1.0}, "radius is -1"),
+    ],
+)
+def test_data_sets_of_no_size(tmp_path, options, message):
+    with pytest.raises(UserError, match=message):
+        render_dataset(bundled("targets")["ball"], tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["a" * 300, "a/" + "b" * 300 + ".xml", "a\0b", "\n"])
+def test_names_that_no_file_system_takes(name):
+    for call in (
+        lambda: load_scene(find_scene(name, "scenes"), {}),
+        lambda: load_dataset(name),
+        lambda: load_envmap(name),
+        lambda: render_dataset(name, "out"),
+        lambda: capture(name, "out"),
+    ):
+        with pytest.raises(UserError, match="^(no |data folder|'.*does not exist)"):
+            call()
+
+
+@pytest.mark.parametrize("where", ["plugins/evil.so", "named/plugins/evil.dylib"])
+def test_code_beside_a_scene_is_not_run(tmp_path, where):
+    """Mitsuba would: it looks for the plugin of a type that it does not know there."""
+    (tmp_path / where).parent.mkdir(parents=True)
+    (tmp_path / where).touch()
+    (tmp_path / "scene.xml").write_text('<scene version="3.0.0"><path value="named"/><shape type="evil"/></scene>')
+    with pytest.raises(UserError, match=r"evil\.\w+ is native code, which Mitsuba would run for .*scene\.xml: move it"):
+        load_scene(tmp_path / "scene.xml", {})

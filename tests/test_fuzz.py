@@ -2,7 +2,8 @@
 gives sound data or a UserError of one line.
 
 A case is a number: it says which file is damaged and how. ``pytest`` runs the first `CASES`;
-``python tests/test_fuzz.py 2000 [FIRST]`` runs 2000, each within `SECONDS`, in a process that may hold `MEMORY` bytes.
+``python tests/test_fuzz.py 2000 [FIRST]`` runs 2000, in a process that may hold `MEMORY` bytes. Each is to end within `SECONDS`,
+and to take no more than `MORE` bytes. The file of a case that fails is kept in `KEPT`.
 """
 
 import faulthandler
@@ -11,6 +12,7 @@ import os
 import random
 import re
 import resource
+import signal
 import struct
 import sys
 import tempfile
@@ -21,11 +23,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
+import rgs_mi
 from rgs_mi.core.errors import UserError
 from rgs_mi.datasets import load_dataset
 from rgs_mi.fit import checkpoint
+from rgs_mi.fit.curves import Curves
 from rgs_mi.priors import files as depth_files
+from rgs_mi.report import results
+from rgs_mi.settings.config import load_config, to_dict
+from rgs_mi.settings.settings import Settings
+from rgs_mi.shading.shader import Shader, initial_weights
 from rgs_mi.surfels.ply import read_ply, write_ply
 
 from captures import (
@@ -44,7 +53,8 @@ from captures import (
     write_png16,
 )
 
-CASES, SECONDS, MEMORY = 200, 10, 2 << 30
+CASES, SECONDS, MEMORY, MORE = 200, 10, 2 << 30, 1 << 29
+KEPT = Path(__file__).parents[1] / ".fuzz"
 OPENCV = (*FOCAL, *PRINCIPAL, -0.1, 0.02, 0.01, -0.01)
 
 
@@ -53,6 +63,7 @@ OPENCV = (*FOCAL, *PRINCIPAL, -0.1, 0.02, 0.01, -0.01)
 
 def write_all(root: Path) -> list:
     """(loader, files it reads) of small captures and other files below ``root``."""
+    import mitsuba as mi  # after rgs_mi
 
     def folder(name):
         (root / name).mkdir()
@@ -111,6 +122,11 @@ def write_all(root: Path) -> list:
     for step in (1, 2):
         checkpoint.save(run, surfels, {"step": step})
 
+    (root / "settings.yaml").write_text(yaml.safe_dump(to_dict(Settings())))
+    Shader(mi.TensorXf(initial_weights(0))).save(root / "shader.npz")
+    Curves([{"step": 1, "psnr": 20.5}, {"step": 2, "psnr": 21.5}]).write(run)
+    (run / "metrics.json").write_text(json.dumps({"finished": True, "settings": to_dict(Settings()), "psnr": 30.5}))
+
     views, maps = load_dataset(blender).train, folder("depths")
     depth = np.linspace(1, 4, 24 * 30, dtype=np.float32).reshape(24, 30)
     views = [type(view)(f"d{i}", view.camera, view.pixels, view.masked, None, view.path) for i, view in enumerate(views * 2)]
@@ -128,6 +144,9 @@ def write_all(root: Path) -> list:
         (lambda: check_finite(read_ply(root / "surfels.ply").values()), [root / "surfels.ply"]),
         (lambda: check_checkpoint(checkpoint.load_latest(run)), inside(run)),
         (lambda: check_depths(depth_files.load(views, maps)), inside(maps)),
+        (lambda: load_config(Settings, [root / "settings.yaml"]), [root / "settings.yaml"]),
+        (lambda: check_finite([Shader.load(root / "shader.npz").weights.numpy()]), [root / "shader.npz"]),
+        (lambda: (results.saved_figures(run), Curves.read(run)), [run / "metrics.json", run / "curves.csv"]),
     ]
 
 
@@ -221,23 +240,37 @@ def run_case(targets, number: int) -> str:
     rng = random.Random(number)
     load, paths = targets[number % len(targets)]
     path = rng.choice(paths)
-    good = path.read_bytes()
+    good, bad = path.read_bytes(), b""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     try:
         if rng.random() < 0.02:
             path.unlink()
         else:
-            path.write_bytes(damaged(good, rng))
+            path.write_bytes(bad := damaged(good, rng))
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             load()
+        more = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - peak) << 10
+        assert more < MORE, f"it took {more >> 20} MiB"
         return "data"
     except UserError as error:
         assert len(str(error).splitlines()) == 1, f"case {number}: not one line: {str(error)!r}"
         return "UserError"
     except Exception as error:
+        KEPT.mkdir(exist_ok=True)
+        (KEPT / f"{number}-{path.name}").write_bytes(bad)
         raise AssertionError(f"case {number}: {path.name}: {type(error).__name__}: {error}") from error
     finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
         path.write_bytes(good)
+
+
+def too_long(number, frame):
+    raise TimeoutError(f"it takes more than {SECONDS} seconds")
+
+
+signal.signal(signal.SIGPROF, too_long)
 
 
 # ---- In the suite, and alone ----
@@ -292,6 +325,7 @@ def test_files_that_unpack_to_more_than_they_should(tmp_path, monkeypatch):
 
 def main(count: int, first: int = 0):
     """Run cases, print those that fail and what all gave, and exit with 1 where one failed."""
+    rgs_mi.set_variant()
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     outcomes, slowest, failures = Counter(), (0.0, None), 0
     with tempfile.TemporaryDirectory() as folder:

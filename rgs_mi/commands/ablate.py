@@ -189,7 +189,7 @@ def _fit_scene(group, jobs, errors, xml, out, quiet):
     scene = group[0].scene
     try:
         digest, views = apart(photographs, xml, group[0].data, group[0].settings["resolution"], quiet)
-        check_photographs(out / scene, digest)
+        check_photographs([job.folder for job in group], digest)
     except UserError as error:
         for job in group:
             failed(job, error)

@@ -4,6 +4,7 @@ verb ``capture`` calls.
 Everything is made in a folder beside the capture's, which appears whole or not at all.
 """
 
+import os
 import shutil
 import tempfile
 from dataclasses import replace
@@ -79,7 +80,7 @@ def capture(
 
 def _checked(source, out, masks, mask_command, frames) -> list[str]:
     """The words of the command that makes masks. Raises: UserError for what is known to be bad before any work."""
-    if not source.exists():
+    if not os.path.exists(source):
         raise UserError(f"'{source}' does not exist: give a folder of photographs, or a video")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"{out} is there and not empty: choose another --out, or delete it")

@@ -12,11 +12,13 @@ import numpy as np
 
 from ..core.camera import Camera
 from ..core.errors import UserError
+from ..core.inputs import JSON, read_file
+from ..core.ownership import owned
 from ..core.scene_files import load_scene, spp_of
 from ..datasets import load_dataset
 from ..evaluation import lpips
 from ..evaluation.evaluate import SCORES
-from ..export.mitsuba_scene import SCENE, sensor_id
+from ..export.mitsuba_scene import SCENE, ids_of, sensor_ids
 from ..fit.curves import Curves
 from ..plugins import lit_surfels
 from ..report import cameras, results
@@ -58,22 +60,25 @@ def reevaluate(run: str | Path, data: str | Path | None = None, quiet: bool = Fa
     background, longest = _setting(saved, "background", (0, 1), run), _setting(saved, "resolution", (1, 1 << 16), run)
     folder = data or saved.get("photographs")
     dataset, registration = _photographs(folder, scene, run, int(longest), quiet)
-    mean, scores, rows, _ = results.measure(surfels, lighting, dataset, background, spp_of(scene), run, quiet, registration)
-    if not lpips.installed():
-        _keep_lpips(saved, mean, scores)
-    now = {"photographs": str(dataset.root.resolve()), "evaluated": results.circumstances()}
-    figures = {k: v for k, v in saved.items() if k != "views"} | mean | now | {"views": scores}
-    results.publish(run, figures, curves, rows, Environment.from_emitter(scene.environment()))
+    with owned(run):
+        mean, scores, rows, _ = results.measure(
+            surfels, lighting, dataset, background, spp_of(scene), run, quiet, registration
+        )
+        if not lpips.installed():
+            _keep_lpips(saved, mean, scores)
+        now = {"photographs": str(dataset.root.resolve()), "evaluated": results.circumstances()}
+        figures = {k: v for k, v in saved.items() if k != "views"} | mean | now | {"views": scores}
+        results.publish(run, figures, curves, rows, Environment.from_emitter(scene.environment()))
     return figures
 
 
 def _saved(path) -> dict:
     """What metrics.json holds. Raises: UserError where it is missing, damaged, or of something else."""
     try:
-        saved = json.loads(path.read_text())
+        saved = json.loads(read_file(path, JSON))
         wrong = [name for name, kind in _FACTS.items() if not isinstance(saved[name], kind)]
         wrong += [name for name, scores in saved["views"].items() if not isinstance(scores, dict)]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise UserError(f"{path}: missing, damaged, or not of a run ({error}): give the folder that a fit wrote") from error
     if wrong:
         raise UserError(f"{path}: '{wrong[0]}' is not what a fit writes there: give the folder that a fit wrote")
@@ -108,7 +113,7 @@ def _photographs(folder, scene, run, longest, quiet):
         raise UserError(f"{run / results.METRICS} does not say where the photographs are: give their folder with --data")
     dataset = load_dataset(folder, longest, quiet)
     views, sensors = results.evaluation_views(dataset), scene.sensors()
-    same = [sensor_id(view.name) for view in views] == [sensor.id() for sensor in sensors]
+    same = sensor_ids([view.name for view in views], ids_of(run / SCENE)) == [sensor.id() for sensor in sensors]
     registration = cameras.read(run, views) if same else None
     given = [view.camera for view in views]
     if registration is not None:  # then sensors stand where these views were found to be, not where they were given

@@ -1,17 +1,16 @@
 """Fits of a suite of scenes, each done once and gone on with where it was interrupted: what `ablate` and `suite` share."""
 
 import contextlib
-import hashlib
 import io
 import json
-import shutil
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..core.errors import UserError
+from ..core.errors import Stopped, UserError
 from ..core.files import atomic_file
+from ..core.ownership import owned
 from ..datasets import is_capture, looked_for
 from ..datasets.types import View
 from ..fit import checkpoint
@@ -20,9 +19,6 @@ from ..fit.scene import FitScene
 from ..report import results
 from ..report.tables import DETAILS, FIGURES, csv_text
 from .optimize import optimize
-
-_DIGEST = "photographs.sha256"  # beside or above the fits: what they are of
-
 
 # ---- What there is to do ----
 
@@ -49,10 +45,8 @@ class Job:
 
     def figures(self) -> dict | None:
         """Return what metrics.json of the finished fit holds; None where there is none, or one with other settings."""
-        if not results.finished(self.folder):
-            return None
-        figures = json.loads((self.folder / results.METRICS).read_text())
-        return figures if self.has(figures["settings"]) else None
+        figures = results.saved_figures(self.folder)
+        return figures if figures and figures["finished"] and self.has(figures["settings"]) else None
 
 
 def find_scenes(suite: str | Path) -> dict[str, Path]:
@@ -94,34 +88,31 @@ def photographs(xml: str | Path, data: str | Path, longest: int, quiet: bool) ->
     Raises: UserError for photographs that can't be read.
     """
     dataset = FitScene.load(xml, data).dataset(longest, quiet)
-    digest = hashlib.sha256()
-    for view in [*dataset.train, *dataset.test]:
-        for part in (view.name.encode(), view.camera.to_world.tobytes(), view.pixels.tobytes()):
-            digest.update(part)
-    return digest.hexdigest(), results.preview_views(results.evaluation_views(dataset))[::2]
+    return dataset.digest, results.preview_views(results.evaluation_views(dataset))[::2]
 
 
-def check_photographs(folder: Path, digest: str) -> None:
-    """Note the ``digest`` of what the fits below ``folder`` are of. Raises: UserError where those that are there are of
-    other photographs."""
-    path = folder / _DIGEST
-    if path.is_file() and path.read_text().strip() != digest:
-        raise UserError(f"{folder} holds fits to other photographs: delete it, or choose another --out")
-    with atomic_file(path) as stream:
-        stream.write(f"{digest}\n".encode())
+def check_photographs(folders: Iterable[Path], digest: str) -> None:
+    """Check that the runs that are there of ``folders`` are of the photographs with this ``digest``. Raises: UserError where one
+    is of others."""
+    for folder in folders:
+        saved = results.saved_figures(folder)
+        if saved and dict(saved.get("digests") or ()).get("photographs") != digest:
+            raise UserError(f"{folder} holds a fit to other photographs: delete it, or choose another --out")
 
 
 def fit(xml: str | Path, job: Job, quiet: bool) -> None:
-    """Do a job, or go on with it. Raises: UserError where it fails, or is stopped."""
-    saved = checkpoint.load_latest(job.folder)
-    resume = saved is not None and not results.finished(job.folder) and job.has(saved[1]["settings"])
+    """Do a job, or go on with it; a fit with other settings is moved aside. Raises: UserError where it fails, or is stopped."""
+    saved = None if results.finished(job.folder) else checkpoint.load_latest(job.folder)
+    resume = saved is not None and job.has(saved[1]["settings"])
     if saved and not resume:
-        warnings.warn(f"{job.folder} had other settings: starting again", stacklevel=2)
-        shutil.rmtree(job.folder / "checkpoints")
-    with contextlib.redirect_stdout(io.StringIO()):
-        optimize(xml, data=job.data, config=job.config, overrides=job.overrides, out=job.folder, resume=resume, quiet=quiet)
-    if job.figures() is None:
-        raise UserError("stopped before its end: the same command goes on")
+        with owned(job.folder) as mine:
+            warnings.warn(f"{job.folder} had other settings: it is {mine.move_aside()} now", stacklevel=2)
+    options = {"data": job.data, "config": job.config, "overrides": job.overrides, "out": job.folder}
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            optimize(xml, **options, resume=resume, quiet=quiet)
+    except Stopped as stop:
+        raise UserError("stopped before its end: the same command goes on") from stop
 
 
 # ---- What comes out ----

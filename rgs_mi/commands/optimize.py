@@ -1,6 +1,7 @@
 """A fit from beginning to end: photographs and scene in, a run's folder out. What `rgs-mi optimize` calls."""
 
-import shutil
+import os
+import signal
 import sys
 import time
 import warnings
@@ -10,15 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import report
 from ..core.bounding_box import BoundingBox
-from ..core.errors import UserError
-from ..core.files import make_folder
+from ..core.errors import Stopped, UserError
 from ..core.interrupt import GracefulInterrupt
+from ..core.ownership import Owned, owned
 from ..core.progress import Progress
 from ..core.runtime import cache_folder
 from ..datasets.types import Dataset
-from ..fit import checkpoint, light
-from ..fit.events import Events
+from ..export.mitsuba_scene import SCENE
+from ..fit import checkpoint, events, light
 from ..fit.model import Model
 from ..fit.plan import planned, told
 from ..fit.scene import FitScene
@@ -55,35 +57,45 @@ def optimize(
     Args:
       data, variables: see `FitScene.load`
       config, overrides, minutes, seed: the settings, each over the former (see `FitScene.settings`)
-      out:     the run's folder (default: runs/NAME)
+      out:     the run's folder (default: runs/NAME), which no other process can have at the same time. A run that is there is
+               moved aside, to NAME.1 and so on, when the fit begins; an unfinished one is refused
       resume:  go on from the newest checkpoint in ``out``
       tensorboard: write event files into the folder's ``tensorboard``
       window:  host and port of a page that shows the fit while it goes on (`viewer.live`)
 
-    Raises: UserError for bad input, a package that is missing, a folder that can't be written, and a fit that diverges.
+    Raises: UserError for bad input, a package that is missing, a folder that can't be written, and a fit that diverges;
+    Stopped where someone has stopped it, by a signal or in the window, after everything is saved, and evaluated as well after
+    Ctrl-C, but not after SIGTERM.
     """
     if window:
         server.check(*window)
+    if tensorboard:
+        events.check()
     scene = FitScene.load(path, data, variables)
     overrides = [*overrides, *budget(minutes), *([f"seed={seed}"] if seed is not None else [])]
     settings = scene.settings(config, overrides)
     folder = Path(out) if out else Path("runs") / scene.name
-    saved = _saved(folder, resume)
-    events = Events(folder / "tensorboard", saved[1]["step"] if saved else 0) if tensorboard else None
-    dataset = scene.dataset(settings.resolution, quiet)
-    make_folder(folder)
-    fit = _resume(saved, scene, dataset, settings) if saved else start(scene, dataset, settings, quiet)
-    if not quiet:
-        print(told(fit.settings, dataset))
-    watch = _watched(fit, folder, window)
-    try:
-        stopped = _loop(fit, folder, quiet, events, watch)
-    finally:
-        for opened in filter(None, (events, watch)):
-            opened.close()
-    results.write(fit, scene, folder, quiet)
+    if os.path.realpath(folder / SCENE) == os.path.realpath(scene.path):
+        raise UserError(f"{folder} holds the scene that is fitted, which its results would replace: choose another --out")
+    with owned(folder) as mine:
+        saved = _saved(folder, resume)
+        dataset = scene.dataset(settings.resolution, quiet)
+        fit = _resume(saved, scene, dataset, settings, folder) if saved else start(scene, dataset, settings, quiet)
+        if not saved:
+            _make_room(mine, scene)
+        if not quiet:
+            print(told(fit.settings, dataset))
+        log = events.Events(folder / "tensorboard", fit.step_number) if tensorboard else None
+        watch = _watched(fit, folder, window)
+        try:
+            stopped = _loop(fit, folder, quiet, log, watch)
+        finally:
+            for opened in filter(None, (log, watch)):
+                opened.close()
+        if stopped in (None, signal.SIGINT):  # what sends other signals does not wait for results
+            results.write(fit, scene, folder, quiet)
     if stopped:
-        print(f"stopped at {100 * fit.progress:.0f}%; go on with the same command and --resume")
+        raise Stopped(stopped, f"stopped at {100 * fit.progress:.0f}%; go on with the same command and --resume")
     return folder
 
 
@@ -111,11 +123,18 @@ def _saved(folder, resume):
         if saved is None:
             print(f"{folder} holds no checkpoint: starting from the beginning", file=sys.stderr)
         return saved
-    if any((folder / "checkpoints").glob("step_*.npz")):
-        if not results.finished(folder):
-            raise UserError(f"{folder} holds an unfinished run: go on with --resume, or choose another --out")
-        shutil.rmtree(folder / "checkpoints")
+    if any((folder / "checkpoints").glob("step_*.npz")) and not results.finished(folder):
+        raise UserError(f"{folder} holds an unfinished run: go on with --resume, or choose another --out")
     return None
+
+
+def _make_room(mine: Owned, scene):
+    """Move a run that is in the folder aside, and say so. Raises: UserError where that can't be."""
+    if not any((mine.folder / name).exists() for name in (results.METRICS, report.REPORT)):
+        return
+    if any(Path(os.path.realpath(p)).is_relative_to(os.path.realpath(mine.folder)) for p in (scene.path, scene.photographs)):
+        raise UserError(f"{mine.folder} holds a run, and what it was fitted to: choose another --out")
+    print(f"{mine.folder} holds a run: it is {mine.move_aside()} now", file=sys.stderr)
 
 
 def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = True) -> Fit:
@@ -201,14 +220,27 @@ def _priors(dataset, settings):
     return depth_priors(settings.prior.name, dataset.train, cache=cache_folder("priors"), **settings.prior.options)
 
 
-def _resume(saved, scene, dataset, settings) -> Fit:
-    """The fit of a checkpoint, under ``settings``; tells which differ from those that it was saved with."""
+def _resume(saved, scene, dataset, settings, folder) -> Fit:
+    """The fit of a checkpoint, under ``settings``; tells which differ from those that it was saved with.
+
+    Raises: UserError for a checkpoint of something else, and for settings that can't change.
+    """
     arrays, meta = saved
+    try:
+        return _gone_on_with(arrays, meta, scene, dataset, settings)
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise UserError(
+            f"{folder / 'checkpoints'}: its newest is not one of a fit ({type(error).__name__}: {error}): start again in "
+            "another --out"
+        ) from error
+
+
+def _gone_on_with(arrays, meta, scene, dataset, settings):
     settings = planned(settings, dataset)
     for name in ("box", "light", "turns"):  # what was decided at the start
         if getattr(settings, name) in (None, "auto") and (value := meta["settings"].get(name)):
             settings = replace(settings, **{name: tuple(value) if isinstance(value, list) else value})
-    if meta["photographs"] != _photographs(dataset):
+    if meta["digests"]["photographs"] != dataset.digest:
         raise UserError(f"{dataset.root}: not the photographs of the checkpoint: give its --data, or another --out")
     old, new = _flat(meta["settings"]), _flat(to_dict(settings))
     changed = [key for key in new if old.get(key) != new[key]]
@@ -219,11 +251,6 @@ def _resume(saved, scene, dataset, settings) -> Fit:
         print(f"settings differ from the checkpoint's, the new ones hold: {listing}", file=sys.stderr)
     shading, priors = _shading(scene, settings, dataset), _priors(dataset, settings)
     return Fit.resume(dataset, settings, arrays, meta, shading=shading, priors=priors)
-
-
-def _photographs(dataset) -> list:
-    """What tells one data set from another: names and sizes of its training views."""
-    return [[view.name, *map(int, view.camera.size)] for view in dataset.train]
 
 
 def _flat(tree, prefix="") -> dict:
@@ -237,16 +264,17 @@ def _flat(tree, prefix="") -> dict:
 # ---- Loop ----
 
 
-def _loop(fit, folder, quiet, events=None, watch=None) -> bool:
-    """Step until the budget is spent or someone interrupts, also in a window (``watch``); returns whether someone did. Begins
+def _loop(fit, folder, quiet, events=None, watch=None) -> int | None:
+    """Step until the budget is spent or someone stops it, also in a window (``watch``); returns None, or by which signal. Begins
     and ends with a checkpoint: a folder that can't be written is known before the work, not after it."""
     settings, psnr = fit.settings, None
     checkpoint.save(folder, *_state(fit, folder))
-    (folder / results.METRICS).unlink(missing_ok=True)  # from here on the run is unfinished
-    saved = time.monotonic()
+    if fit.progress < 1:
+        (folder / results.METRICS).unlink(missing_ok=True)  # from here on the run is unfinished
+    saved, paused = time.monotonic(), False
     planned = None if settings.iterations else max(0.0, 60 * settings.minutes - fit.elapsed)
     with GracefulInterrupt() as interrupt, Progress(planned, quiet) as progress:
-        while fit.progress < 1 and not interrupt.requested:
+        while fit.progress < 1 and interrupt.signal is None:
             before = fit.elapsed
             recorded = fit.step()
             if not np.isfinite(fit.psnr):
@@ -258,17 +286,29 @@ def _loop(fit, folder, quiet, events=None, watch=None) -> bool:
             if events and recorded:
                 events.add(fit.curves.rows[-1])
             if time.monotonic() - saved > settings.checkpoint_seconds:
-                state = _state(fit, folder)
-                try:
-                    checkpoint.save(folder, *state)
-                except UserError as error:
-                    warnings.warn(f"no checkpoint this time, the fit goes on: {error}", stacklevel=2)
-                saved = time.monotonic()
+                paused, saved = _paused(fit, folder, paused), time.monotonic()
             if watch:
-                watch.between(lambda: interrupt.requested)
-                interrupt.requested |= watch.stopped
-        checkpoint.save(folder, *_state(fit, folder))
-    return interrupt.requested
+                watch.between(lambda: interrupt.signal is not None)
+                if watch.stopped:
+                    interrupt.signal = interrupt.signal or signal.SIGINT
+        _paused(fit, folder, paused)
+    return interrupt.signal
+
+
+def _paused(fit, folder, before) -> bool:
+    """Save a checkpoint; returns whether the disk takes none, which is told once: ``before`` says what was returned last."""
+    state = _state(fit, folder)
+    try:
+        checkpoint.save(folder, *state)
+    except UserError as error:
+        if not before:
+            warnings.warn(
+                f"no checkpoints while it lasts, the last good one stays and the fit goes on: {error}", stacklevel=2
+            )
+        return True
+    if before:
+        print("checkpoints are written again", file=sys.stderr)
+    return False
 
 
 def _state(fit, folder):
@@ -276,7 +316,7 @@ def _state(fit, folder):
     arrays, meta = fit.state()
     if not all(np.isfinite(a).all() for a in arrays.values()):
         raise _diverged(fit, folder)
-    return arrays, meta | {"settings": to_dict(fit.settings), "photographs": _photographs(fit.dataset)}
+    return arrays, meta | {"settings": to_dict(fit.settings), "digests": results.digests(fit.dataset, fit.settings)}
 
 
 def _diverged(fit, folder):

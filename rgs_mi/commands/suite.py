@@ -122,7 +122,7 @@ def fit_suite(
 
 def _scene(xml, job, quiet):
     """Fit a scene, unless that is done."""
-    check_photographs(job.folder, photographs(xml, job.data, job.settings["resolution"], quiet)[0])
+    check_photographs([job.folder], photographs(xml, job.data, job.settings["resolution"], quiet)[0])
     if job.figures() is None:
         if not quiet:
             print(job.folder, flush=True)

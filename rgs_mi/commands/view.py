@@ -1,6 +1,5 @@
 """A window on a finished run. What `rgs-mi view` calls."""
 
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ from ..core.scene_files import load_scene
 from ..datasets import load_dataset
 from ..datasets.resolution import LONGEST
 from ..export.mitsuba_scene import SCENE
-from ..report.results import METRICS, finished
+from ..report.results import finished, saved_figures
 from ..viewer.exports import Exports
 from ..viewer.server import Server, check
 from ..viewer.subject import Subject
@@ -57,12 +56,12 @@ def _photographs(path, data):
     given and holds none."""
     if data is not None:
         return load_dataset(data).train
-    try:
-        saved = json.loads((path / METRICS).read_text())
-        folder, longest = saved["photographs"], saved["settings"].get("resolution", LONGEST)
-        return load_dataset(folder, longest).train
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    saved = saved_figures(path) or {}
+    folder, longest = saved.get("photographs"), saved.get("settings", {}).get("resolution", LONGEST)
+    if not isinstance(folder, str) or not isinstance(longest, int):
         return []  # of no run
+    try:
+        return load_dataset(folder, longest).train
     except UserError as error:
         print(f"without photographs: {error}", file=sys.stderr)
         return []

@@ -1,13 +1,30 @@
 """The one exception that reaches a person: a single line that names the file and the remedy."""
 
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Callable
+from contextlib import contextmanager
 from typing import NoReturn
+
+from .telling import one_line, patient_streams
 
 
 class UserError(Exception):
-    """Bad input. The message is one line: what is wrong, in which file, and what to do about it."""
+    """Bad input. The message is one line: what is wrong, in which file, and what to do about it. Whatever does not print in it,
+    as in the names of files, is escaped."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(one_line(message))
+
+
+class Stopped(KeyboardInterrupt):
+    """Someone, or a scheduler, has stopped the command by a ``signal``; ``message`` is what to do about it."""
+
+    def __init__(self, number: int, message: str = "interrupted") -> None:
+        super().__init__(message)
+        self.code = 128 + number  # as shells have it: 130 for Ctrl-C, 143 for SIGTERM, 129 for a terminal that is gone
 
 
 def listed(kind: Callable = str) -> Callable[[str], list]:
@@ -28,19 +45,39 @@ def parse_variables(pairs: list[str]) -> dict[str, str]:
 
 
 def run_main(main: Callable[[], int | str | None]) -> NoReturn:
-    """Call ``main()`` as a command and exit with what it returns: a `UserError` prints one line and exits with 2, Ctrl-C
-    with 130; warnings print one line each."""
-    with warnings.catch_warnings():
+    """Call ``main()`` as a command and exit with what it returns: a `UserError` prints one line and exits with 2, Ctrl-C and
+    SIGTERM with the code of `Stopped`; warnings print one line each. Nothing that is told ends the command (`telling`)."""
+    with warnings.catch_warnings(), patient_streams(), _terminable():
         warnings.showwarning = _print_warning
         try:
             sys.exit(main())
         except UserError as error:
             print(f"error: {error}", file=sys.stderr)
             sys.exit(2)
-        except KeyboardInterrupt:
-            print("interrupted", file=sys.stderr)
-            sys.exit(130)
+        except MemoryError as error:
+            print(f"error: out of memory ({one_line(error)}): use fewer or smaller photographs", file=sys.stderr)
+            sys.exit(2)
+        except KeyboardInterrupt as stop:
+            stopped = stop if isinstance(stop, Stopped) else Stopped(signal.SIGINT)
+            print(stopped, file=sys.stderr)
+            sys.exit(stopped.code)
+
+
+@contextmanager
+def _terminable():
+    """SIGTERM unwinds, so that locks and half-written files go, also in process 1 of a container, which it does not end."""
+
+    def stop(number, frame):
+        raise Stopped(number)
+
+    main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, stop) if main else None
+    try:
+        yield
+    finally:
+        if main:
+            signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
 
 
 def _print_warning(message, *_, **__):
-    print("warning:", *str(message).split(), file=sys.stderr)
+    print("warning:", one_line(" ".join(str(message).split())), file=sys.stderr)

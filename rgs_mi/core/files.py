@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +17,8 @@ from .errors import UserError
 if TYPE_CHECKING:
     import mitsuba as mi
 
+TEMPORARY = r"\..+\.[0-9a-f]{12}\.tmp"  # what names of half-written files match
+
 
 @contextmanager
 def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
@@ -24,9 +27,9 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
     Raises: UserError where the disk is full or the folder can't be written.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.tmp")  # no process's number: containers share disks
     try:
-        with _explained(path):
+        with explained(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             with open(temporary, "wb") as stream:
                 yield stream
@@ -46,12 +49,12 @@ def make_folder(folder: str | Path) -> None:
 
     Raises: UserError where it can't be made.
     """
-    with _explained(folder):
+    with explained(folder):
         Path(folder).mkdir(parents=True, exist_ok=True)
 
 
 @contextmanager
-def _explained(path: str | Path) -> Iterator[None]:
+def explained(path: str | Path) -> Iterator[None]:
     """Turn what the system says against writing ``path`` into a `UserError`."""
     try:
         yield

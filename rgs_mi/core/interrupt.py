@@ -1,25 +1,29 @@
-"""Ctrl-C that lets a fit finish its step and save, instead of throwing the work away."""
+"""Signals that let a fit finish its step and save, instead of throwing the work away."""
 
 import os
 import signal
 import threading
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+from .errors import Stopped
+
+_HUP = getattr(signal, "SIGHUP", None)  # not on Windows
+_SIGNALS = tuple(filter(None, (signal.SIGINT, signal.SIGTERM, _HUP)))
 _MESSAGE = b"\nstopping after this step; press again to abort\n"
 
 
 class GracefulInterrupt:
-    """A context manager in which the first SIGINT or SIGTERM sets ``requested``, and a second one raises KeyboardInterrupt.
+    """A context manager in which the first SIGINT, SIGTERM or SIGHUP is noted as ``signal``, and a second one raises `Stopped`.
 
-    The handlers that were there before return on exit. Outside the main thread, where Python allows no handlers, it
-    does nothing and ``requested`` stays False.
+    The handlers that were there before return on exit; SIGHUP stays ignored where it was, below ``nohup``. Outside the main
+    thread, where Python allows no handlers, it does nothing and ``signal`` stays None.
     """
 
-    requested: bool = False
+    signal: int | None = None
 
     def __enter__(self) -> "GracefulInterrupt":
         main = threading.current_thread() is threading.main_thread()
-        self._before = {s: signal.signal(s, self._handle) for s in _SIGNALS} if main else {}
+        asked = [s for s in _SIGNALS if s != _HUP or signal.getsignal(s) != signal.SIG_IGN] if main else []
+        self._before = {s: signal.signal(s, self._handle) for s in asked}
         return self
 
     def __exit__(self, *_) -> None:
@@ -28,9 +32,9 @@ class GracefulInterrupt:
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
     def _handle(self, number, frame):
-        if self.requested:
-            raise KeyboardInterrupt
-        self.requested = True
+        if self.signal is not None:
+            raise Stopped(number)
+        self.signal = number
         try:
             os.write(2, _MESSAGE)  # not print(): a handler may run inside a print, whose buffer is not reentrant
         except OSError:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from .files import atomic_file
+from .inputs import opened
 
 _HEADER_LIMIT = 1 << 20  # bytes
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
@@ -31,7 +32,7 @@ def read_vertices(path: str | Path) -> np.ndarray:
     Raises: OSError; ValueError for a file that is damaged or has no vertices, with the reason alone as its message, which
     says 'it' of the file: a caller adds its name and the remedy.
     """
-    with open(path, "rb") as stream:
+    with opened(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         form, elements, start = _header(stream.read(_HEADER_LIMIT))
         before = elements[: next((k for k, (name, *_) in enumerate(elements) if name == "vertex"), len(elements))]

@@ -1,12 +1,15 @@
 """Mitsuba scene files in, scenes out; what is wrong with a file in one line."""
 
+import os
 import re
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from pathlib import Path
 
 import mitsuba as mi
 
 from .errors import UserError
+from .inputs import is_file
 
 _PACKAGE = Path(__file__).parents[1]
 
@@ -25,7 +28,7 @@ def find_scene(name: str, kind: str) -> Path:
     Raises: UserError for a bare name that is neither.
     """
     path, known = Path(name), bundled(kind)
-    if path.exists() or path.suffix or len(path.parts) > 1:
+    if os.path.exists(path) or path.suffix or len(path.parts) > 1:
         return path
     if name not in known:
         raise UserError(f"no file or folder '{name}' here, and no scene of that name: choose one of {', '.join(known)}")
@@ -37,8 +40,9 @@ def load_scene(path: str | Path, variables: Mapping[str, object]) -> "mi.Scene":
 
     Raises: UserError, in one line, for whatever is wrong with the scene.
     """
-    if not Path(path).is_file():
+    if not is_file(path):
         raise UserError(f"no scene at {path}: check the path")
+    _check_no_code(Path(path))
     try:
         # In parallel, surfels that wait for Dr.Jit may take over the reading of an EXR, whose own tasks wait for a thread that
         # waits for Python, to make another of our plugins: for ever.
@@ -51,6 +55,21 @@ def load_scene(path: str | Path, variables: Mapping[str, object]) -> "mi.Scene":
             text = text.rpartition("UserError: ")[2]
         text = " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\] ", "", text).split())
         raise UserError(f"cannot load {path}: {text}") from error
+
+
+def _check_no_code(path):
+    """Mitsuba takes the plugin of an unknown type from ``plugins/TYPE.so`` beside the scene, on the paths that this names, or in
+    the current folder, and runs it. Raises: UserError where there is such code, which scenes of others might have brought."""
+    try:
+        named = [e.get("value") or "" for e in ET.parse(path).getroot().iter("path")]
+    except (ET.ParseError, OSError):
+        named = []  # Mitsuba says what is wrong
+    for folder in dict.fromkeys([path.parent, Path(), *(path.parent / name for name in named)]):
+        for found in (folder / "plugins").glob("*"):
+            if found.suffix in (".so", ".dylib", ".dll") and os.path.isfile(found):
+                raise UserError(
+                    f"{found} is native code, which Mitsuba would run for {path}: move it, if you trust the scene"
+                )
 
 
 def spp_of(scene: "mi.Scene") -> int:

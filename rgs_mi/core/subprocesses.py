@@ -79,7 +79,7 @@ class _Call:
         """(value, None) or (None, UserError)."""
         try:
             value, error = self.receive.recv()
-        except EOFError:  # it ended without a word
+        except (EOFError, OSError):  # it ended without a word, or in the middle of one
             value, error = None, None
         self.process.join()
         code = self.process.exitcode

@@ -13,17 +13,19 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from .errors import UserError
+from .inputs import MOST, read_file
 
 
-def load(source: str | Path | BinaryIO) -> Any:
+def load(source: str | Path | BinaryIO, most: int = MOST) -> Any:
     """Return what the pickle ``source`` (a path or a binary stream) holds: containers, numbers, text and NumPy arrays of
-    numbers.
+    numbers. A file may have ``most`` bytes. Containers may hold one another so often that to print or convert them takes for
+    ever: types are to be asked first.
 
     Raises: UserError for a file that is missing, damaged or holds anything else.
     """
     name = getattr(source, "name", source)
     try:
-        data = Path(source).read_bytes() if isinstance(source, str | Path) else source.read()
+        data = read_file(source, most) if isinstance(source, str | Path) else source.read()
         return _Unpickler(io.BytesIO(data)).load()
     except OSError as error:
         raise UserError(f"{name}: can't be read ({error.strerror or error}): check the path") from None

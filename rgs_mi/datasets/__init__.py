@@ -1,5 +1,6 @@
 """Photographs and their cameras: a folder in, lists of `View` out."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -20,7 +21,7 @@ def load_dataset(root: str | Path, longest: int = LONGEST, quiet: bool = True) -
     Raises: UserError when the folder is missing, has no known layout, or when a file in it is bad.
     """
     root = Path(root)
-    if not root.is_dir():
+    if not os.path.isdir(root):  # unlike Path's it answers False to names that no file system takes
         raise UserError(f"data folder '{root}' does not exist: give a capture's folder with --data")
     layout = _layout(root)
     if layout is None:
@@ -49,13 +50,13 @@ def _tell_scaled(dataset, longest):
 
 def is_capture(root: Path) -> bool:
     """Return whether ``root`` is a folder with one of the layouts of `load_dataset`; what is in its files is not asked."""
-    return root.is_dir() and _layout(root) is not None
+    return os.path.isdir(root) and _layout(root) is not None
 
 
 def is_photographed(root: Path) -> bool:
     """Return whether ``root`` is a folder whose layout is one of photographs (`Dataset.photographed`); its files are not
     read."""
-    layout = _layout(root) if root.is_dir() else None
+    layout = _layout(root) if os.path.isdir(root) else None
     return layout is not None and layout.PHOTOGRAPHED
 
 

@@ -8,6 +8,7 @@
 A pose is world to camera (x right, y down, z forward); the quaternion is (w, x, y, z). Little endian.
 """
 
+import io
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..core.errors import UserError
+from ..core.inputs import opened, read_file
 from .distortion import Distortion
 
 # in the order of their numbers; how many parameters each has, None where the lens is not a perspective one with Brown's
@@ -143,8 +145,8 @@ def _once(records, what: str) -> dict:
 
 
 def _lines(path):
-    with open(path, encoding="utf-8") as stream:
-        return [line.strip() for line in stream]
+    with opened(path) as stream, io.TextIOWrapper(stream, "utf-8") as text:
+        return [line.strip() for line in text]
 
 
 def _cameras_text(path):
@@ -178,7 +180,7 @@ def _images_text(path):
 
 def _binary(path, record):
     """The records of a file, each read by ``record(content, at)``, which returns it and where it ends."""
-    content = path.read_bytes()
+    content = read_file(path)
     (count,), at, records = struct.unpack_from("<Q", content), 8, []
     for index in range(count):
         try:

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ..core.inputs import opened
+
 ORIENTATION = 0x0112
 _EXIF, _FOCAL_35MM, _EXPOSURE, _APERTURE, _ISO = 0x8769, 0xA405, 0x829A, 0x829D, 0x8827
 
@@ -43,7 +45,7 @@ def log_gains(paths: Sequence[Path]) -> np.ndarray:
     values = []
     for path in paths:
         try:
-            with Image.open(path, formats=("PNG", "JPEG")) as image:
+            with opened(path) as stream, Image.open(stream, formats=("PNG", "JPEG")) as image:
                 values.append(exposure_value(image.getexif()))
         except Exception:  # what is no PNG or JPEG, or damaged in its EXIF alone, tells nothing
             values.append(None)
@@ -51,3 +53,15 @@ def log_gains(paths: Sequence[Path]) -> np.ndarray:
             return np.zeros(len(paths))
     stops = np.array(values, float)
     return -np.log(2) * (stops - stops.mean()) if len(stops) else stops
+
+
+def orientation(path: Path) -> int:
+    """Return how the EXIF of a JPEG says that it lies: 1 upright, or where it does not tell; the others are turned or mirrored.
+    PNGs are not asked: Pillow would decode all of one."""
+    from PIL import Image
+
+    try:
+        with opened(path) as stream, Image.open(stream, formats=("JPEG",)) as image:
+            return int(image.getexif().get(ORIENTATION, 1)) or 1
+    except Exception:  # as in `log_gains`
+        return 1

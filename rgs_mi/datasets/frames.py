@@ -1,26 +1,32 @@
 """From the frames that a layout names to views: what all layouts share."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from threading import BoundedSemaphore
+from threading import Condition
 
 import numpy as np
 
 from ..core.camera import Camera
 from ..core.errors import UserError
+from ..core.memory import available, words
 from .distortion import Distortion, cropped_to_valid, undistorted
-from .images import check_proportions, image_size, limited, read_image, read_normal, with_mask
+from .exif import orientation
+from .images import check_proportions, image_size, is_linear, limited, read_image, read_normal, with_mask
 from .points import FARTHEST
 from .types import View
 
 HOLD_OUT = 8  # as LLFF, Mip-NeRF 360 and 3DGS have it
 FOCAL_LIMITS = (1e-3, 1e8)  # pixels
 SIZE_LIMITS = (0, 1e6)  # pixels; the principal point lies between -1e6 and 1e6
-_AT_ONCE = BoundedSemaphore(3)  # photographs that are held at their full size, however many threads there are
+_DECODED = 1 << 30  # bytes that photographs may take at their full size while they are read, of several at the same time
+_WORK = 12  # bytes a pixel that reading one takes at its full size: as the file has it, as RGBA, and between; of EXR 4 times that
+_HELD = {False: 4, True: 16}  # bytes a pixel of what is kept: 8 bits, or float
+_CACHE = 8  # bytes a pixel that a fit keeps beside it, in half precision
 
 
 @dataclass(frozen=True)
@@ -72,8 +78,15 @@ def load_views(source: Path, frames: list[Frame], longest: int) -> list[View]:
             f"(first: {str(missing[0].path)!r})",
             stacklevel=4,
         )
+    budget, sizes = _planned(source, found, longest)
     with ThreadPoolExecutor() as pool:
-        views = list(pool.map(partial(_load_view, longest=longest), found))
+        views = list(pool.map(partial(_load_view, longest=longest, budget=budget), found, sizes))
+    if turned := [view.path for view in views if orientation(view.path) != 1]:
+        warnings.warn(
+            f"{source}: EXIF of {len(turned)} photographs (first: {turned[0].name}) says that they lie on their side; they are "
+            "taken as they are stored, as COLMAP and nerfstudio do",
+            stacklevel=4,
+        )
     kept = [view for view in views if view.pixels[..., 3].any()]
     if not kept:
         raise UserError(f"{source}: the alpha channel of every image is zero: export with a mask, or as RGB")
@@ -152,11 +165,63 @@ def pinhole(
     return Camera(to_world, floats(focal), floats(principal), (size[0], size[1])).resized(*photograph)
 
 
-def _load_view(frame: Frame, longest: int) -> View:
+# ---- Memory ----
+
+
+class _Budget:
+    """So many bytes, of which threads take and give back; who wants more than all gets all."""
+
+    def __init__(self, total: int) -> None:
+        self._total = self._left = total
+        self._changed = Condition()
+
+    @contextmanager
+    def taken(self, amount: int) -> Iterator[None]:
+        amount = min(amount, self._total)
+        with self._changed:
+            self._changed.wait_for(lambda: self._left >= amount)
+            self._left -= amount
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._left += amount
+                self._changed.notify_all()
+
+
+def _planned(source, frames, longest) -> tuple[_Budget, list[tuple[int, int]]]:
+    """What reading ``frames`` may take at the same time, and the size of each, from their headers: nothing is decoded yet.
+
+    Raises: UserError where this process can't have the memory for them; warns where a fit to them can't.
+    """
+    with ThreadPoolExecutor() as pool:
+        sizes = list(pool.map(lambda frame: image_size(frame.path, frame.where), frames))
+    linear = [is_linear(frame.path) for frame in frames]
+    areas = [int(np.prod(limited(size, longest))) for size in sizes]
+    kept = sum(_HELD[kind] * area for kind, area in zip(linear, areas))
+    work = max(_work_of(size, kind) for size, kind in zip(sizes, linear))
+    free = available()
+    if free is None:
+        return _Budget(_DECODED), sizes
+    side = min(longest, max(map(max, sizes)))
+    what = f"{source}: its {len(frames)} photographs take {words(kept)} of memory at {side} pixels"
+    fitting = side * min(1.0, (max(0.8 * free - work, 0) / kept) ** 0.5)
+    remedy = f"give a smaller resolution: --set resolution={max(int(fitting) // 100 * 100, 16)}"
+    if kept + work > free:
+        raise UserError(f"{what}, and {words(work)} while the largest is read, where {words(free)} are free: {remedy}")
+    if (fitted := kept + _CACHE * sum(areas)) > free:
+        warnings.warn(f"{what}, a fit to them up to {words(fitted)}, and {words(free)} are free: {remedy}", stacklevel=5)
+    return _Budget(min(_DECODED, max((free - kept) // 2, 1))), sizes
+
+
+def _work_of(size, linear) -> int:
+    return _WORK * (4 if linear else 1) * size[0] * size[1]
+
+
+def _load_view(frame: Frame, size: tuple[int, int], longest: int, budget: _Budget) -> View:
     assert frame.camera is not None, "its image is there"
-    size = image_size(frame.path, frame.where)
     scaled = limited(size, longest)
-    with _AT_ONCE:
+    with budget.taken(_work_of(size, is_linear(frame.path))):
         pixels, masked = read_image(frame.path, frame.where, scaled)
         if frame.mask and not masked:
             pixels, masked = with_mask(pixels, frame.mask(), frame.where)

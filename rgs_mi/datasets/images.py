@@ -1,6 +1,7 @@
 """Image files as arrays: photographs, masks and normal maps; PNG and JPEG (8 and 16 bit), OpenEXR."""
 
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from scipy import ndimage
 
 from ..core.color import srgb_decode
 from ..core.errors import UserError
+from ..core.inputs import check_file, opened
 
 EXTENSIONS = (".png", ".exr", ".jpg", ".jpeg")  # in order of preference where a file is named without one
 MAX_PIXELS = 1 << 26  # 8192 x 8192; a header that promises more is damaged or hostile
@@ -19,10 +21,11 @@ def read_image(path: Path, where: str, size: tuple[int, int] | None = None) -> t
     to ``size`` (width, height) where that is given and another.
 
     The means of scaling are weighted with alpha, and of display values where the file has those. 16-bit PNGs keep their high
-    bytes. EXR files are linear with premultiplied alpha, as the format has it; ``where`` begins the message.
+    bytes. EXR files are linear with premultiplied alpha, as the format has it; where their alpha is 0 the rest does not count.
+    ``where`` begins the message.
     Raises: UserError when the file is damaged, empty, too large, or holds NaN or infinity.
     """
-    pixels, alpha = _decoded(_read_exr if _linear(path) else _read_ldr, path, where, size)
+    pixels, alpha = _decoded(_read_exr if is_linear(path) else _read_ldr, path, where, size)
     if not alpha:
         pixels[..., 3] = 255 if pixels.dtype == np.uint8 else 1
     opaque = pixels[..., 3].min() >= (255 if pixels.dtype == np.uint8 else 1)
@@ -31,7 +34,7 @@ def read_image(path: Path, where: str, size: tuple[int, int] | None = None) -> t
 
 def image_size(path: Path, where: str) -> tuple[int, int]:
     """Return the (width, height) that an image's header tells. Raises: UserError as `read_image` does."""
-    return _decoded(_size_of_exr if _linear(path) else _size_of_ldr, path, where)
+    return _decoded(_size_of_exr if is_linear(path) else _size_of_ldr, path, where)
 
 
 def limited(size: tuple[int, int], longest: int) -> tuple[int, int]:
@@ -70,7 +73,8 @@ def check_proportions(size: tuple[float, float], photograph: tuple[int, int], wh
         )
 
 
-def _linear(path):
+def is_linear(path: Path) -> bool:
+    """Return whether an image is an OpenEXR file, by its name."""
     return path.suffix.lower() == ".exr"
 
 
@@ -78,7 +82,7 @@ def _decoded(read, path, where, *options):
     try:
         return read(path, *options)
     except Exception as error:  # decoders raise anything from OSError to SyntaxError on damaged files
-        reason = (str(error) or type(error).__name__).splitlines()[0]
+        reason = (getattr(error, "strerror", None) or str(error) or type(error).__name__).splitlines()[0]
         raise UserError(f"{where}: {path} cannot be read as an image ({reason}): replace the file") from error
 
 
@@ -87,13 +91,14 @@ def _opened(path):
     """A PNG or JPEG of tolerable size, not decoded yet."""
     from PIL import Image, UnidentifiedImageError
 
-    try:
-        image = Image.open(path, formats=("PNG", "JPEG"))
-    except UnidentifiedImageError as error:
-        raise ValueError("not a PNG or JPEG file") from error
-    with image:
-        check_size(*image.size)
-        yield image
+    with opened(path) as stream:
+        try:
+            image = Image.open(stream, formats=("PNG", "JPEG"))
+        except UnidentifiedImageError as error:
+            raise ValueError("not a PNG or JPEG file") from error
+        with image:
+            check_size(*image.size)
+            yield image
 
 
 def _size_of_ldr(path: Path) -> tuple[int, int]:
@@ -129,35 +134,83 @@ def _read_grey(path: Path) -> np.ndarray:
         return np.asarray(image.convert("L"))
 
 
-def _size_of_exr(path: Path) -> tuple[int, int]:
+def exr_channels(path: Path, chosen: Callable[[list[str]], Iterable[str]], fill: float) -> dict[str, np.ndarray]:
+    """Return those channels of an OpenEXR file that are ``chosen`` of their names, {name: [H, W] float32}, and read no others.
+    They are of the file's display window, which is the image: ``fill`` where its data window has nothing.
+
+    Raises: OSError, ValueError and whatever else the library raises on damaged files.
+    """
+    import Imath
     import OpenEXR
 
+    names, data, display = _exr_header(path)
+    taken = list(dict.fromkeys(chosen(names)))
+    with closing(OpenEXR.InputFile(str(path))) as file:
+        planes = file.channels(taken, Imath.PixelType(Imath.PixelType.FLOAT))
+    width, height = _extent(data)
+    placed = {}
+    for name, plane in zip(taken, planes):
+        plane = np.frombuffer(plane, np.float32).reshape(height, width)
+        placed[name] = plane if (data == display).all() else _placed(plane, data[0] - display[0], _extent(display), fill)
+    return placed
+
+
+def _placed(plane, corner, size, fill):
+    """An image of ``size`` (width, height) that has a ``plane`` at its ``corner`` (x, y), as far as it lies inside."""
+    (x, y), (height, width) = corner, plane.shape
+    image = np.full(size[::-1], fill, np.float32)
+    left, top, right, bottom = max(x, 0), max(y, 0), min(x + width, size[0]), min(y + height, size[1])
+    if left < right and top < bottom:
+        image[top:bottom, left:right] = plane[top - y : bottom - y, left - x : right - x]
+    return image
+
+
+def _exr_header(path):
+    """(names of the channels, data window, display window) of an OpenEXR file; a window is [[x, y], [x, y]], with its last pixel.
+    Raises: ValueError for windows of intolerable size."""
+    import OpenEXR
+
+    check_file(path)
     with OpenEXR.File(str(path), header_only=True) as file:
-        lower, upper = file.header()["dataWindow"]
-        size = int(upper[0]) - int(lower[0]) + 1, int(upper[1]) - int(lower[1]) + 1
-    check_size(*size)
-    return size
+        header = file.header()
+        data, display = (np.array([*header[name]], np.int64) for name in ("dataWindow", "displayWindow"))
+        names = [channel.name for channel in header["channels"]]
+    for window in (data, display):
+        check_size(*_extent(window))
+    return names, data, display
+
+
+def _extent(window) -> tuple[int, int]:
+    """(width, height) of a window."""
+    width, height = (window[1] - window[0] + 1).tolist()
+    return width, height
+
+
+def _size_of_exr(path: Path) -> tuple[int, int]:
+    return _extent(_exr_header(path)[2])
 
 
 def _read_exr(path: Path, size: tuple[int, int] | None) -> tuple[np.ndarray, bool]:
     """[H, W, 4] float32 of an OpenEXR file with straight alpha, scaled to ``size`` (width, height), and whether it has
     alpha."""
-    import OpenEXR
     from PIL import Image
 
-    whole = _size_of_exr(path)
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        channels = {name: channel.pixels for name, channel in file.channels().items()}
-    if "Y" in channels:
-        channels = {**dict.fromkeys("RGB", channels["Y"]), **channels}
-    if not {"R", "G", "B"} <= channels.keys():
-        raise ValueError(f"channels {', '.join(sorted(channels))}, but R, G and B are needed")
-    alpha = channels.get("A")
-    pixels = np.stack([channels[c] for c in "RGB"] + [np.ones_like(channels["R"]) if alpha is None else alpha], -1)
-    pixels = np.maximum(pixels.astype(np.float32), 0)
+    def chosen(names):
+        colors = ["R", "G", "B"] if {"R", "G", "B"} <= {*names} else ["Y"]
+        if colors == ["Y"] and "Y" not in names:
+            raise ValueError(f"channels {', '.join(sorted(names))[:80]}, but R, G and B are needed")
+        return [*colors, "A"] if "A" in names else colors
+
+    channels = exr_channels(path, chosen, 0.0)
+    alpha, gray = channels.get("A"), channels.get("Y")
+    colors = [channels["RGB"[k]] if gray is None else gray for k in range(3)]
+    pixels = np.stack([*colors, np.ones_like(colors[0]) if alpha is None else alpha], -1)
+    if alpha is not None:
+        pixels[alpha == 0] = 0  # renderers leave NaN where nothing is
+    pixels = np.maximum(pixels, 0)
     if not np.isfinite(pixels).all():
         raise ValueError("NaN or infinite pixels")
-    if size and size != whole:  # its colours are premultiplied yet
+    if size and size != pixels.shape[1::-1]:  # its colours are premultiplied yet
         planes = [
             Image.fromarray(plane).resize(size, Image.Resampling.HAMMING) for plane in np.moveaxis(pixels, 2, 0).copy()
         ]

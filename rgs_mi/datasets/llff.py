@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import UserError
+from ..core.inputs import check_file
 from .frames import Frame, every_eighth, load_split, pinhole, rigid
 from .images import EXTENSIONS, read_grey
 from .points import sparse_points
@@ -66,6 +67,7 @@ def load(root: Path, longest: int = LONGEST) -> Dataset:
 def _read(file: Path) -> np.ndarray:
     """[N, 17] float64, N > 0; memory is taken for what the file holds, not for what its header promises."""
     try:
+        check_file(file)
         table = np.lib.format.open_memmap(file, mode="r")
         if table.ndim != 2 or table.shape[1] != COLUMNS or not len(table) or table.dtype.kind not in "fiu":
             raise ValueError(f"it holds {table.dtype} {list(table.shape)}, not numbers [N, {COLUMNS}]")

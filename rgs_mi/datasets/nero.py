@@ -16,6 +16,7 @@ import numpy as np
 
 from ..core import unpickle
 from ..core.errors import UserError
+from ..core.inputs import CAMERA as CAMERA_FILE
 from .frames import Frame, every_eighth, load_split, pinhole, rigid
 from .images import read_grey
 from .points import sparse_points
@@ -57,7 +58,7 @@ def _frame(file: Path) -> Frame:
     name, where = file.name.removesuffix(CAMERA), str(file)
     image, depth = find_image(file.with_name(name)), file.with_name(name + DEPTH)
     try:
-        pose, intrinsics = (np.asarray(value, np.float64) for value in unpickle.load(file))
+        pose, intrinsics = map(_numbers, unpickle.load(file, CAMERA_FILE))
         ((fx, skew, cx), (zero, fy, cy), last), moved = intrinsics, np.vstack([pose, [0, 0, 0, 1]])
         if not abs(skew) <= 1e-6 * abs(fx) or zero or tuple(last) != (0, 0, 1) or moved.shape != (4, 4):
             raise ValueError
@@ -74,6 +75,18 @@ def _frame(file: Path) -> Frame:
     )
 
 
+def _numbers(value) -> np.ndarray:
+    """A matrix [rows, columns] of three or four each. Raises: ValueError for anything else, before it is looked at closely:
+    lists in a pickle may be nested without end."""
+    if isinstance(value, list) and all(
+        isinstance(row, list) and all(isinstance(x, int | float) for x in row) for row in value
+    ):
+        value = np.array(value, np.float64)
+    if not isinstance(value, np.ndarray) or value.shape not in ((3, 4), (3, 3)):
+        raise ValueError
+    return value.astype(np.float64)
+
+
 def _mask(depth: Path, where: str) -> np.ndarray:
     return (_DEPTH_RANGE * read_grey(depth, where) < _BACKGROUND).astype(np.float32)
 
@@ -84,7 +97,9 @@ def _held_out(root: Path, names: list[str]) -> set[str]:
     if file is None:
         return every_eighth(names)
     try:
-        test, _ = unpickle.load(file)
+        test, _ = unpickle.load(file, CAMERA_FILE)
+        if not all(isinstance(name, str | int | np.integer) for name in test):
+            raise ValueError
         listed = {str(name) for name in test} & set(names)
     except (TypeError, ValueError) as error:
         raise UserError(f"{file} holds no lists of test and training views: get it again, or remove it") from error

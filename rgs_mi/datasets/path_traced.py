@@ -18,6 +18,7 @@ import hashlib
 import importlib.util
 import json
 import math
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,13 +29,17 @@ import numpy as np
 from ..core.camera import Camera, opaque, pixel_directions
 from ..core.color import srgb_encode, to_8bit
 from ..core.errors import UserError
-from ..core.files import write_bitmap, write_json
+from ..core.files import make_folder, write_bitmap, write_json
+from ..core.inputs import is_file
+from ..core.ownership import LOCK, owned
 from ..core.progress import Progress
 from ..core.scene_files import load_scene
 
 if TYPE_CHECKING:
     import mitsuba as mi
 
+MANIFEST = "truth.json"
+MOST = {"train": 100_000, "test": 100_000, "size": 8192, "spp": 65_536}  # of what a data set is asked for
 FOV = 39.6  # degrees, Blender's default camera (0.691 rad)
 MARGIN = 1.02  # keeps the object's bounding sphere off the frame
 TEST_SPP = 4  # times the samples of a training view: noise in a test view counts against every score
@@ -185,7 +190,7 @@ def _digest(path: Path, seen: set) -> str:
     parts = [hashlib.sha256(content).hexdigest()]
     if path.suffix == ".xml":
         for name in sorted(set(re.findall(r'(?:value|filename)\s*=\s*"([^"]+)"', content.decode(errors="replace")))):
-            if (path.parent / name).is_file():
+            if os.path.isfile(path.parent / name):  # unlike Path's it answers False to names that no file system takes
                 parts.append(_digest((path.parent / name).resolve(), seen))
     return hashlib.sha256("".join(parts).encode()).hexdigest()
 
@@ -203,34 +208,35 @@ def _code_digest() -> str:
     return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()
 
 
-def _prepare(out: Path, key: dict) -> bool:
-    """Make ``out`` ready for a data set with the given key; True when it is already complete.
+def _complete(out: Path, key: dict) -> bool:
+    """Whether ``out`` holds the data set with the given key, all of it.
 
-    Views of other settings are deleted, but only in a folder that a former call has made.
+    Raises: UserError for a folder of something else.
     """
-    manifest = out / "truth.json"
-    old = None
+    manifest = out / MANIFEST
     if manifest.is_file():
         try:
             old = json.loads(manifest.read_text())
-        except ValueError as error:
+            return old["key"] == key and bool(old["complete"])
+        except (ValueError, KeyError, TypeError) as error:
             raise UserError(f"{manifest} is damaged: delete the folder {out} and start again") from error
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and (not out.is_dir() or any(path.name != LOCK for path in out.iterdir())):
         raise UserError(f"{out} exists and is not a data set of render_dataset: choose another folder with --out")
-    if old is not None and old.get("key") == key:
-        return bool(old.get("complete"))
-    if old is not None:
+    return False
+
+
+def _prepare(out: Path, key: dict):
+    """Make ``out`` ready for the rest of the data set with the given key: views with another are deleted."""
+    manifest = out / MANIFEST
+    if manifest.is_file() and json.loads(manifest.read_text())["key"] != key:
+        write_json(manifest, {"key": None, "complete": False})  # of neither, until the other's views are gone
         for split in ("train", "test"):
             (out / f"transforms_{split}.json").unlink(missing_ok=True)
             for file in [*(out / split).glob("r_*"), *(out / split).glob(".r_*")]:
                 file.unlink()
-    try:
-        for split in ("train", "test"):
-            (out / split).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"cannot make the folder {out}: {error.strerror}: choose another with --out") from error
-    write_json(manifest, {"key": key, "complete": False})
-    return False
+    write_json(manifest, {"key": key, "complete": False})  # first: it says whose the folder is
+    for split in ("train", "test"):
+        make_folder(out / split)
 
 
 def _frame(split: str, index: int, camera: Camera) -> dict:
@@ -260,13 +266,16 @@ def render_dataset(
       seed: turns the cameras around the object and reseeds the sampler
 
     Returns: ``out`` as a Path. Needs an active variant.
+    Another process that renders into ``out`` is waited for.
     Raises: UserError for scenes that do not load or hold nothing, and for folders that can't be written.
     """
     xml, out, variables = Path(xml), Path(out), dict(variables or {})
     for name, value in {"train": train, "test": test, "size": size, "spp": spp}.items():
-        if value < 1:
-            raise UserError(f"{name} is {value}: needs at least 1")
-    if not xml.is_file():
+        if not 1 <= value <= MOST[name]:
+            raise UserError(f"{name} is {value}: needs at least 1 and at most {MOST[name]}")
+    if radius is not None and not 0 < radius < math.inf:
+        raise UserError(f"radius is {radius:g}: needs a positive distance")
+    if not is_file(xml):
         raise UserError(f"no scene at {xml}: check the path")
     key = {
         "scene": _digest(xml.resolve(), set()),
@@ -279,9 +288,17 @@ def render_dataset(
         "seed": seed,
         "code": _code_digest(),
     }
-    if _prepare(out, key):
-        return out
+    if not _complete(out, key):
+        with owned(out, wait=True):
+            if not _complete(out, key):  # another process may have been at it
+                _prepare(out, key)
+                _render(xml, out, key, variables, quiet)
+    return out
 
+
+def _render(xml, out, key, variables, quiet):
+    """Render what ``out`` lacks of the data set with the given key."""
+    train, test, size, spp, radius, seed = (key[name] for name in ("train", "test", "size", "spp", "radius", "seed"))
     scene = load_scene(xml, variables)
     try:
         center, extent = bounds(scene)
@@ -305,5 +322,4 @@ def render_dataset(
     for split, cs in cameras.items():
         frames = [_frame(split, i, camera) for i, camera in enumerate(cs)]
         write_json(out / f"transforms_{split}.json", {"camera_angle_x": math.radians(FOV), "frames": frames})
-    write_json(out / "truth.json", {"key": key, "complete": True})
-    return out
+    write_json(out / MANIFEST, {"key": key, "complete": True})

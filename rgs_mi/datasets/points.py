@@ -1,5 +1,6 @@
 """The sparse reconstruction beside the photographs: a PLY point cloud, or COLMAP's points3D in text or binary."""
 
+import io
 import os
 import struct
 import warnings
@@ -10,6 +11,7 @@ import numpy as np
 
 from ..core.color import srgb_decode
 from ..core.errors import UserError
+from ..core.inputs import opened, read_file
 from ..core.ply_format import names_of, read_vertices
 
 FILES = (
@@ -45,7 +47,7 @@ def sparse_points(root: str | Path, files: Sequence[str] = FILES) -> tuple[np.nd
         positions, encoded = read(path)
         _check(positions, encoded)
     except (OSError, ValueError, OverflowError, MemoryError) as error:
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())[:200] or type(error).__name__
         raise UserError(
             f"{path} cannot be used as a point cloud ({reason}): export it again, or remove it to start without one"
         ) from error
@@ -90,15 +92,15 @@ def _read_ply(path):
 
 def _read_colmap_text(path):
     """``POINT3D_ID X Y Z R G B ERROR TRACK...`` in each line but comments (#)."""
-    with open(path, encoding="utf-8") as stream, warnings.catch_warnings():
+    with opened(path) as stream, io.TextIOWrapper(stream, "utf-8") as text, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "loadtxt: input contained no data")
-        table = np.loadtxt(stream, usecols=range(1, 7), ndmin=2)
+        table = np.loadtxt(text, usecols=range(1, 7), ndmin=2)
     return table[:, :3], table[:, 3:] / 255
 
 
 def _read_colmap_binary(path):
     """A uint64 count, then as many `_COLMAP_POINT`, each followed by its track."""
-    content = path.read_bytes()
+    content = read_file(path)
     size, at = len(content), 8
     count = int.from_bytes(content[:at], "little")
     if count > (size - at) // _COLMAP_POINT.itemsize:

@@ -6,6 +6,7 @@ gives what publications use: images_4 for Ref-NeRF Real and for the outdoor scen
 scenes.
 """
 
+import os
 import re
 from pathlib import Path
 
@@ -15,10 +16,13 @@ LONGEST = 1600
 def chosen(folder: Path, side: float, longest: int = LONGEST) -> Path:
     """Return ``folder`` or the smaller copy beside it, for photographs whose longer side is ``side`` pixels in ``folder``
     and should be ``longest`` at most."""
-    choices = {1: folder} if folder.is_dir() else {}
-    for copy in folder.parent.glob(f"{folder.name}_*") if side > longest or not choices else ():
-        match = re.fullmatch(r"_([1-9]\d{0,2})", copy.name[len(folder.name) :])
-        if match and copy.is_dir():
-            choices[int(match[1])] = copy
+    choices = (
+        {1: folder} if os.path.isdir(folder) else {}
+    )  # unlike Path's it answers False to names that no file system takes
+    if (side > longest or not choices) and os.path.isdir(folder.parent):
+        for name in os.listdir(folder.parent):
+            match = re.fullmatch(re.escape(folder.name) + r"_([1-9]\d{0,2})", name)
+            if match and os.path.isdir(folder.parent / name):
+                choices[int(match[1])] = folder.parent / name
     fitting = [factor for factor in choices if side / factor <= longest]
     return choices[min(fitting) if fitting else max(choices)] if choices else folder

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..core.errors import UserError
+from ..core.inputs import JSON, read_file
 from .distortion import Distortion
 from .frames import FOCAL_LIMITS, SIZE_LIMITS, Frame, pinhole, rigid
 from .images import EXTENSIONS
@@ -30,7 +31,7 @@ def read_json(file: Path) -> dict:
     """Parse the file, of which only the shape of the outermost level is checked: an object with a list of frames, each an
     object. Raises: UserError for anything else."""
     try:
-        meta = json.loads(file.read_bytes().decode("utf-8-sig"))
+        meta = json.loads(read_file(file, JSON).decode("utf-8-sig"))
     except OSError as error:
         raise UserError(f"{file} cannot be read ({error.strerror}): the layout needs it") from error
     except json.JSONDecodeError as error:

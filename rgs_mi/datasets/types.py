@@ -1,6 +1,8 @@
 """The types of a capture: photographs with their cameras, and what is known of their depths."""
 
+import hashlib
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +53,19 @@ class Dataset:
     point_colors: np.ndarray | None = None
     root: Path = field(default_factory=Path)
     photographed: bool = False
+
+    @cached_property
+    def digest(self) -> str:
+        """What tells these photographs from all others: a hash of the names, pixels and cameras of all views. Cameras count to
+        four decimals, because processors round their last bits in different ways."""
+        digest = hashlib.sha256()
+        for kind, views in (("train", self.train), ("test", self.test)):
+            for view in views:
+                camera = view.camera
+                numbers = np.concatenate([np.ravel(camera.to_world), camera.focal, camera.principal])
+                digest.update(repr((kind, view.name, view.pixels.shape, (np.round(numbers, 4) + 0.0).tolist())).encode())
+                digest.update(np.ascontiguousarray(view.pixels).data)
+        return digest.hexdigest()
 
 
 @dataclass(frozen=True)

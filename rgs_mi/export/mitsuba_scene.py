@@ -1,14 +1,16 @@
 """A fit as files that Mitsuba loads: surfels, environment, shader, and the scene that puts them together."""
 
 import copy
+import itertools
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..core.errors import UserError
 from ..core.files import atomic_file, write_exr
 from ..datasets.types import View
 from ..shading.environment import Environment
@@ -63,16 +65,39 @@ def export(
     )
     if any(abs(v.camera.focal[0] / v.camera.focal[1] - 1) > _SQUARE for v in views):
         warnings.warn(f"{folder / SCENE}: the cameras' pixels are not square, those of its sensors are", stacklevel=2)
-    root.extend(_sensor(view, spp) for view in views)
+    ids = sensor_ids([view.name for view in views], _ids(root))
+    root.extend(_sensor(view, name, spp) for view, name in zip(views, ids))
     ET.indent(root, "    ")
     with atomic_file(folder / SCENE) as stream:
         ET.ElementTree(root).write(stream, encoding="utf-8", xml_declaration=True)
     return [folder / name for name in (SCENE, SURFELS, ENVIRONMENT, *([SHADER] if shader else []))]
 
 
-def sensor_id(name: str) -> str:
-    """Return the id of a view's sensor: Mitsuba reads '.' as the path of a parameter."""
-    return name.replace(".", "_")
+def sensor_ids(names: Sequence[str], taken: Iterable[str] = ()) -> list[str]:
+    """Return the ids of the sensors of views called ``names``, each its own and none of those ``taken``: the name, with '_' for
+    what XML does not hold or Mitsuba understands, as '.' in the path of a parameter or '$' before a variable's name, and a number
+    behind it where another is called so already."""
+    ids = list(taken)
+    for name in names:
+        clean = "".join(c if c.isalnum() or c in "-_" else "_" for c in name) or "_"
+        count = itertools.count(2)
+        found = clean
+        while found in ids:
+            found = f"{clean}_{next(count)}"
+        ids.append(found)
+    return ids[len(ids) - len(names) :]
+
+
+def ids_of(path: Path) -> list[str]:
+    """Return the ids in an exported scene file that are not those of sensors. Raises: UserError for malformed XML."""
+    try:
+        return _ids(ET.parse(path).getroot())
+    except (OSError, ET.ParseError) as error:
+        raise UserError(f"{path}: can't be read as XML ({error}): export the scene again") from error
+
+
+def _ids(root):
+    return [found for e in root.iter() if e.tag != "sensor" and (found := e.get("id"))]
 
 
 def _fitted(scene, surfels, environment, properties):
@@ -102,9 +127,9 @@ def _fitted(scene, surfels, environment, properties):
     return root
 
 
-def _sensor(view, spp):
+def _sensor(view, name, spp):
     d = view.camera.to_sensor_dict()
-    sensor = ET.Element("sensor", type="perspective", id=sensor_id(view.name))
+    sensor = ET.Element("sensor", type="perspective", id=name)
     numbers = ("fov", "principal_point_offset_x", "principal_point_offset_y")
     film = ET.Element("film", type="hdrfilm")
     film.extend(

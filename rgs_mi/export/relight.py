@@ -8,6 +8,7 @@ import numpy as np
 
 from ..core.arrays import as_tensor
 from ..core.errors import UserError
+from ..core.inputs import is_file
 from ..plugins import is_deferred, surfels_of
 from ..targets import environments
 
@@ -64,7 +65,7 @@ def load_envmap(envmap: str | Path) -> "mi.Emitter":
     """
     if str(envmap) in environments.ENVIRONMENTS:
         return mi.load_dict({"type": "procedural_envmap", "name": str(envmap)})
-    if not Path(envmap).is_file():
+    if not is_file(envmap):
         raise UserError(
             f"no environment map at {envmap}: check the path, or name one of the suite's: "
             f"{', '.join(sorted(environments.ENVIRONMENTS))}"

@@ -24,6 +24,7 @@ from .relight import edit, relight
 
 _PASS = 16  # samples per pixel at a time
 _MOST = 10_000  # frames
+_WIDEST = 16_384  # pixels along a side
 AOVS = ("albedo", "roughness", "metallic", "sh_normal", "depth", "diffuse", "specular", "alpha")
 
 
@@ -77,6 +78,12 @@ def render_scene(
     for option, count, least in (("--turntable", turntable, 1), ("--path", along, 0)):
         if count is not None and not least <= count <= _MOST:
             raise UserError(f"{option} {count}: needs {least} to {_MOST} frames")
+    for option, numbers, most in (
+        ("--size", size if isinstance(size, tuple) else (size,), _WIDEST),
+        ("--spp", (spp,), 1 << 20),
+    ):
+        if any(n is not None and not 1 <= n <= most for n in numbers):
+            raise UserError(f"{option} {'x'.join(map(str, numbers))}: needs 1 to {most}")
     if filmed:
         if not moves:
             raise UserError("--video: one view makes no video: add --turntable N or --path")

@@ -20,6 +20,7 @@ from ..core.errors import UserError
 from ..core.files import atomic_file
 
 KEEP = 2
+FORMAT = 1  # of what is in a checkpoint, and in metrics.json: another number is another meaning
 _NAME = re.compile(r"step_(\d+)\.npz")
 
 
@@ -32,7 +33,8 @@ def save(folder: str | Path, arrays: Mapping[str, npt.ArrayLike], meta: Mapping[
     Args:
       folder: the run's output folder, created if missing
       arrays: name -> array of numbers, any shape (anything ``numpy.asarray`` takes; objects are refused)
-      meta:   JSON values, with the integer ``step`` among them; numpy scalars and arrays, and paths, are converted
+      meta:   JSON values, with the integer ``step`` among them; numpy scalars and arrays, and paths, are converted. The file
+              also has the number of its `FORMAT`
 
     Raises: UserError where the disk is full or the folder can't be written; the checkpoints there stay as they are.
     """
@@ -40,7 +42,7 @@ def save(folder: str | Path, arrays: Mapping[str, npt.ArrayLike], meta: Mapping[
     folder = Path(folder) / "checkpoints"
     path = folder / f"step_{step:07d}.npz"
     with atomic_file(path) as stream, zipfile.ZipFile(stream, "w") as archive:
-        archive.writestr("meta.json", json.dumps(meta, default=_to_json))
+        archive.writestr("meta.json", json.dumps({"format": FORMAT, **meta}, default=_to_json))
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
@@ -55,12 +57,14 @@ def load_latest(folder: str | Path) -> tuple[dict[str, np.ndarray], dict[str, An
     """Return ``(arrays, meta)`` of the newest readable checkpoint of the run in ``folder``; None where there is none.
 
     Where the newest is damaged it warns, and falls back to the one before.
-    Raises: UserError where there are checkpoints and none can be read.
+    Raises: UserError where there are checkpoints and none can be read, and for one of another `FORMAT`.
     """
     checkpoints = _checkpoints(Path(folder) / "checkpoints")
     for path in reversed(checkpoints.values()):
         try:
             return _load(path)
+        except UserError:
+            raise
         except Exception as error:  # a damaged zip fails in a dozen ways, and each means the same here
             warnings.warn(f"{path} is damaged ({error}): trying the checkpoint before it", stacklevel=2)
     if checkpoints:
@@ -73,6 +77,12 @@ def _load(path):
         if max(info.file_size for info in archive.infolist()) > path.stat().st_size:
             raise ValueError("it unpacks to more than it holds, and none of ours is compressed")
         meta = json.loads(archive.read("meta.json"))
+        if (number := meta.pop("format", None)) != FORMAT:
+            whose = "a newer" if isinstance(number, int) and number > FORMAT else "another"
+            raise UserError(
+                f"{path} has format {str(number)[:20]} of {whose} version, and this one reads {FORMAT}: go on with the version "
+                "that wrote it, or choose another --out"
+            )
         arrays = {}
         for name in archive.namelist():
             if name.endswith(".npy"):

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
+from ..core.inputs import read_file
 
 FILE = "curves.csv"
 STRETCHES = 300  # of equal parts of the budget; a fit has that many rows, or one per step
@@ -58,9 +59,9 @@ class Curves:
         if not path.is_file():
             return cls()
         try:
-            with open(path, newline="") as stream:
-                return cls({k: json.loads(v) for k, v in row.items() if v} for row in csv.DictReader(stream))
-        except (ValueError, TypeError, csv.Error) as error:
+            text = io.StringIO(read_file(path).decode(), newline="")
+            return cls({k: json.loads(v) for k, v in row.items() if v} for row in csv.DictReader(text))
+        except (OSError, ValueError, RecursionError, TypeError, csv.Error) as error:
             raise UserError(f"{path}: damaged ({error}): delete it, the report then has no curves") from error
 
     def column(self, name: str) -> list[float]:

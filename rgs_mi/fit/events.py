@@ -8,6 +8,14 @@ from typing import Any
 from ..core.errors import UserError
 
 
+def check() -> None:
+    """Check that events can be written. Raises: UserError where tensorboardX is not installed."""
+    try:
+        import tensorboardX.event_file_writer  # noqa: F401
+    except ImportError as error:
+        raise UserError("--tensorboard: tensorboardX is not installed: pip install tensorboardX") from error
+
+
 class Events:
     """Writes into ``folder`` what happens from ``step`` on: 0 replaces what is there, another goes on with it.
 
@@ -15,11 +23,10 @@ class Events:
     """
 
     def __init__(self, folder: str | Path, step: int) -> None:
-        try:
-            from tensorboardX.event_file_writer import EventsWriter
-            from tensorboardX.proto import event_pb2, summary_pb2
-        except ImportError as error:
-            raise UserError("--tensorboard: tensorboardX is not installed: pip install tensorboardX") from error
+        check()
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto import event_pb2, summary_pb2
+
         # their classes are made at import, where no type checker sees them
         self._event: Any = event_pb2.Event  # pyright: ignore[reportAttributeAccessIssue]
         self._summary: Any = summary_pb2.Summary  # pyright: ignore[reportAttributeAccessIssue]

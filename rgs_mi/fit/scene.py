@@ -1,5 +1,6 @@
 """What there is to fit: a Mitsuba scene whose surfels name photographs, and the YAML beside it that says how."""
 
+import os
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -97,7 +98,8 @@ class FitScene:
         given = self.photographs
         if "data" not in self.variables:
             return self.path.stem
-        return given.stem if given.suffix == ".xml" else given.name
+        given = Path(os.path.normpath(given))  # 'captures/car/..' is called 'captures'
+        return (given.stem if given.suffix == ".xml" else given.name) or self.path.stem
 
     def settings(self, config: str | Path | None = None, overrides: Sequence[str] = ()) -> Settings:
         """Return the settings: defaults, over them those of the preset `PHOTOGRAPHS` where it is photographs that are

@@ -98,8 +98,8 @@ class Fit:
     @classmethod
     def resume(cls, dataset: Dataset, settings: Settings, arrays: dict, meta: dict, **others) -> "Fit":
         """The fit whose `state` this was. ``others``: ``shading``, ``priors``."""
-        fit = cls(dataset, Model.from_state(arrays), settings, meta["extent"], **others)
-        fit.step_number, fit.views_used, fit.elapsed = meta["step"], meta["views_used"], meta["elapsed"]
+        fit = cls(dataset, Model.from_state(arrays), settings, float(meta["extent"]), **others)
+        fit.step_number, fit.views_used, fit.elapsed = int(meta["step"]), int(meta["views_used"]), float(meta["elapsed"])
         gradients = fit.density.gradients
         gradients.sum, gradients.count = (as_float(arrays[f"gradient_{k}"]) for k in ("sum", "count"))
         for learned in (fit.cameras, fit.turns):

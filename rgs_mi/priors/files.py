@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from ..core.errors import UserError
-from ..datasets.images import MAX_PIXELS, check_size, resize
+from ..core.inputs import opened
+from ..datasets.images import MAX_PIXELS, check_size, exr_channels, resize
 from ..datasets.types import DepthPrior, View
 from .maps import masked
 
@@ -64,12 +65,12 @@ def _read(path: Path) -> np.ndarray:
             raise ValueError(f"it holds {values.dtype}, not numbers")
         return values
     except Exception as error:  # decoders raise anything from OSError to SyntaxError on damaged files
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
         raise UserError(f"{path} cannot be read as a depth map ({reason}): export it again") from error
 
 
 def _read_npz(path):
-    with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as arrays:
+    with opened(path) as stream, np.load(stream, allow_pickle=False) as arrays:
         if "depth" not in arrays and len(arrays) != 1:
             raise ValueError(f"none of its arrays ({', '.join(arrays) or 'it has none'}) is called 'depth'")
         if max(info.file_size for info in arrays.zip.infolist()) > 16 * MAX_PIXELS:
@@ -78,32 +79,27 @@ def _read_npz(path):
 
 
 def _read_npy(path):
-    with open(path, "rb") as stream:  # np.load would take any format
+    with opened(path) as stream:  # np.load would take any format
         return np.lib.format.read_array(stream, allow_pickle=False)
 
 
 def _read_exr(path):
     """The channel called depth, Depth.Z (of any layer), Z or Y, upper or lower case; else the first that is not alpha."""
-    import OpenEXR
-
-    with OpenEXR.File(str(path), header_only=True) as file:
-        lower, upper = file.header()["dataWindow"]
-        check_size(int(upper[0]) - int(lower[0]) + 1, int(upper[1]) - int(lower[1]) + 1)
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        channels = {name: channel.pixels for name, channel in file.channels().items()}
 
     def rank(name):
         name = name.lower()
         layer = name.endswith((".depth", ".depth.z"))
         return [name == "depth", name == "depth.z", layer, name == "z", name == "y", name != "a"].index(True)
 
-    return channels[min(sorted(n for n in channels if n.lower() != "a") or channels, key=rank)]
+    first = lambda names: [min(sorted(n for n in names if n.lower() != "a") or names, key=rank)]
+    (values,) = exr_channels(path, first, np.nan).values()
+    return values
 
 
 def _read_png(path):
     from PIL import Image
 
-    with Image.open(path, formats=("PNG",)) as image:
+    with opened(path) as stream, Image.open(stream, formats=("PNG",)) as image:
         check_size(*image.size)
         if not image.mode.startswith("I"):
             raise ValueError(f"its mode is {image.mode}, and 16-bit grey is needed: 8 bits are too few for depth")

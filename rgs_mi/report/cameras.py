@@ -10,6 +10,7 @@ import numpy as np
 from ..core.camera import Camera
 from ..core.errors import UserError
 from ..core.files import write_json
+from ..core.inputs import JSON, read_file
 from ..core.lens import Lens
 from ..datasets.types import Dataset, View
 from ..evaluation.registration import Registered, Registration
@@ -70,7 +71,7 @@ def read(folder: Path, views: Sequence[View]) -> Registration | None:
     if not path.is_file():
         return None
     try:
-        saved = json.loads(path.read_text())
+        saved = json.loads(read_file(path, JSON))
         poses, exposure = (bool(saved["learned"][name]) for name in ("poses", "exposure"))
         starts, found = {}, {}
         for view in views:
@@ -82,7 +83,7 @@ def read(folder: Path, views: Sequence[View]) -> Registration | None:
             gain = np.array(row["gain"], float).reshape(3) if exposure else None
             found[view.name] = Registered(of("to_world"), gain)
         return Registration(poses, exposure, starts, found)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise UserError(f"{path}: damaged, or not of these photographs ({error}): fit again") from error
 
 

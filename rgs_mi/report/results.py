@@ -1,5 +1,6 @@
 """What a run leaves behind: metrics.json, the scene, pictures of the test views, a contact sheet, a report, a summary."""
 
+import hashlib
 import json
 import platform
 import shlex
@@ -15,14 +16,17 @@ import numpy as np
 
 from .. import __version__, report
 from ..core.files import write_json, write_png
+from ..core.inputs import JSON, read_file
 from ..core.progress import Progress
 from ..core.runtime import cores, peak_rss_mb, release_memory
 from ..datasets.types import Dataset, View
 from ..evaluation import evaluate, lpips, metrics, pictures
 from ..evaluation.registration import Registered, Registration, register
 from ..export.mitsuba_scene import export
+from ..fit import checkpoint
 from ..fit.curves import Curves
 from ..settings.config import to_dict
+from ..settings.settings import Settings
 from ..shading.environment import Environment
 from ..shading.lighting import Lighting
 from ..shading.room import SIDES
@@ -136,15 +140,15 @@ def publish(
     environment: Environment,
     others: Sequence[Path] = (),
 ) -> None:
-    """Write metrics.json, contact sheet and report into ``folder``, and print what came out and where it is, the paths
+    """Write contact sheet, report and metrics.json into ``folder``, and print what came out and where it is, the paths
     ``others`` among it. ``figures`` are what metrics.json holds; `report.write` explains ``curves`` and ``rows``.
 
     Raises: UserError where the disk is full or the folder can't be written.
     """
-    write_json(folder / METRICS, figures)
     lines, texels = _summary(figures), environment.texels.numpy()
     pictures.contact_sheet(folder / SHEET, list(rows.values()), texels, folder.resolve().name, lines)
     report.write(folder, figures, curves, rows, texels)
+    write_json(folder / METRICS, figures)  # last: it says that the run is finished
     print(
         "\n".join(
             [*lines, "", *map(str, (folder / report.REPORT, folder / SHEET, folder / METRICS, *others, folder / "test"))]
@@ -162,18 +166,33 @@ def preview_views(views: Sequence[View]) -> list[View]:
     return [views[k] for k in sorted({int(k) for k in np.linspace(0, len(views) - 1, PREVIEWS + 2)[1:-1].round()})]
 
 
+def saved_figures(folder: Path) -> dict | None:
+    """Return what metrics.json in ``folder`` holds; None where it is missing, damaged, or of no run."""
+    try:
+        saved = json.loads(read_file(folder / METRICS, JSON))
+        return saved if isinstance(saved["settings"], dict) and isinstance(saved["finished"], bool) else None
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+
+
 def finished(folder: Path) -> bool:
     """Return whether the run in ``folder`` came to its end."""
-    try:
-        return bool(json.loads((folder / METRICS).read_text())["finished"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return False
+    saved = saved_figures(folder)
+    return saved is not None and saved["finished"]
+
+
+def digests(dataset: Dataset, settings: Settings) -> dict[str, str]:
+    """Return what tells a fit from all others, as checkpoints and metrics.json have it: hashes of its photographs and of its
+    settings."""
+    written = json.dumps(to_dict(settings), sort_keys=True)
+    return {"photographs": dataset.digest, "settings": hashlib.sha256(written.encode()).hexdigest()}
 
 
 def _facts(fit) -> dict:
     """What metrics.json says of the run as a whole, beside `measure`."""
     table, room = fit.shading.turntable, fit.model.environment().room
     return {
+        "format": checkpoint.FORMAT,
         "finished": fit.progress >= 1,
         "train_seconds": fit.elapsed,
         "iterations": fit.step_number,
@@ -186,6 +205,7 @@ def _facts(fit) -> dict:
         "room": room and {"center": room.center, "distances": dict(zip(SIDES, room.distances))},
         "photographs": str(fit.dataset.root.resolve()),
         "settings": to_dict(fit.settings),
+        "digests": digests(fit.dataset, fit.settings),
         **circumstances(),
     }
 

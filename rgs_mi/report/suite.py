@@ -10,6 +10,7 @@ import numpy as np
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
+from ..core.inputs import JSON, read_file
 from ..datasets.images import read_image
 from . import html
 from .run import REPORT
@@ -52,9 +53,9 @@ def _figures(folder, error):
     if folder is None:
         return {}, error or "no run"
     try:
-        figures = json.loads((folder / "metrics.json").read_text("utf-8"))
+        figures = json.loads(read_file(folder / "metrics.json", JSON))
         unfinished = None if figures["finished"] else "the fit was stopped before its end"
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return {}, error or f"{folder / 'metrics.json'} is missing or damaged: fit the scene again"
     numbers = {name: v for name in FIGURES if isinstance(v := figures.get(name), int | float) and math.isfinite(v)}
     return numbers, error or unfinished

@@ -18,6 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from ..core.errors import UserError
+from ..core.inputs import SETTINGS, read_file
 from .fields import expected, fields, section, section_at, walk
 
 T = TypeVar("T")
@@ -80,7 +81,7 @@ def _read(source):
             f"no preset '{name}': choose one of {', '.join(presets()) or '(none)'}, or give a file as FOLDER/NAME.yaml"
         )
     try:
-        return path.read_text(encoding="utf-8"), name
+        return (read_file(path, SETTINGS) if isinstance(path, Path) else path.read_bytes()).decode("utf-8"), name
     except OSError as error:
         raise UserError(f"{name}: can't be read ({error.strerror}): check the path") from error
     except UnicodeDecodeError as error:

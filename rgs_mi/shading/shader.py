@@ -22,11 +22,13 @@ from drjit import nn
 
 from ..core.errors import UserError
 from ..core.files import atomic_file
+from ..core.inputs import opened
 
 #: [outputs, inputs] of each layer: two hidden ones of 12.
 SHAPES = ((12, 6), (12, 12), (3, 12))
 WEIGHTS = sum(rows * columns for rows, columns in SHAPES)
 _REACH = float(np.log(4))  # ρ
+_MOST = 1 << 16  # bytes of a file; it is some 2 KB
 _REMEDY = "export the scene again, or remove 'shader' from its integrator"
 
 
@@ -76,7 +78,9 @@ class Shader:
         network."""
         path = Path(path)
         try:
-            with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:
+            with opened(path, _MOST) as stream, np.load(stream, allow_pickle=False) as file:
+                if max(info.file_size for info in file.zip.infolist()) > _MOST:
+                    raise ValueError("it unpacks to more than any shader is")
                 arrays = {name: file[name] for name in _arrays()}
         except OSError as error:
             raise UserError(f"{path}: can't be read ({error.strerror or error}): check the path") from error

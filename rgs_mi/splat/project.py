@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 #: Names of the ten geometric numbers of a projected Gaussian.
 GEOMETRY = ("x", "y", "A_x", "A_y", "B_x", "B_y", "N_x", "N_y", "z", "opacity")
-NEAR = 1e-2  # surfels closer than this (scene units) are not drawn
+NEAR, NEAR_SCALES = 1e-2, 0.5  # surfels closer than this in scene units, and in standard deviations, are not drawn
 EDGE_ON = 1e-3  # least |cosine| between a surfel's normal and the ray to its center that (1) divides by
 
 
@@ -61,7 +61,7 @@ def project(surfels: "Surfels", camera: Camera, means2d_offset: "mi.Vector2f | N
     scales = surfels.column(mi.Vector2f, "scales")
     n, a, b = R @ n_world, (R @ t_u) / scales.x, (R @ t_v) / scales.y
 
-    visible = p.z > NEAR
+    visible = p.z > dr.minimum(NEAR, NEAR_SCALES * dr.maximum(scales.x, scales.y))
     z = dr.select(visible, p.z, 1)
     x, y = p.x / z, p.y / z
     per_pixel = _per_pixel(f, lens, x, y)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..core.camera import Camera, opaque
 from .gbuffer import Maps
-from .project import NEAR
+from .project import NEAR, NEAR_SCALES
 from .tiles import BLOCK, LOW_PASS, Cutoffs
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def _front_to_back(surfels, camera) -> np.ndarray:
     (width, height), camera = camera.size, camera.baked()
     fields = {name: value.astype(np.float64) for name, value in surfels.numpy().items()}
     center = (fields["centers"] - camera.origin) @ camera.rotation.T
-    front = np.flatnonzero(center[:, 2] > NEAR)
+    front = np.flatnonzero(center[:, 2] > np.minimum(NEAR, NEAR_SCALES * fields["scales"].max(1)))
     center, scales = center[front], fields["scales"][front]
     t_u, t_v, normal = (v.numpy().T[front].astype(np.float64) @ camera.rotation.T for v in surfels.frames())
     projected = camera.project(fields["centers"][front])[0]

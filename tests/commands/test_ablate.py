@@ -15,6 +15,7 @@ from PIL import Image
 from rgs_mi.commands import ablate, jobs
 from rgs_mi.core import subprocesses
 from rgs_mi.core.errors import UserError
+from rgs_mi.fit import checkpoint
 from rgs_mi.fit.scene import FitScene
 from rgs_mi.report import results, tables
 
@@ -136,11 +137,12 @@ def test_goes_on(suite, tmp_path, inside, capsys):
     shutil.copytree(tmp_path / "one" / "baseline", tmp_path / "two" / "baseline")
     assert call(suite, tmp_path, scenes=["two"], variants=["baseline"]) == 0 and len(inside) == 2
     assert [r["scene"] for r in read(tmp_path)["runs"]] == ["one", "one", "two"]  # the tables tell of all that is there
-    with pytest.warns(UserWarning, match="other settings"):
-        call(suite, tmp_path, scenes=["one"], variants=["full"], overrides=[*SMALL, "iterations=2"])
+    call(suite, tmp_path, scenes=["one"], variants=["full"], overrides=[*SMALL, "iterations=2"])
+    assert json.loads((tmp_path / "one" / "full.1" / "metrics.json").read_text()) == metrics
     assert inside[2:] == ["one/full"] and [r["iterations"] for r in read(tmp_path)["runs"]] == [2]
 
-    (tmp_path / "one" / "photographs.sha256").write_text("others")
+    file = tmp_path / "one" / "full" / "metrics.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"digests": {"photographs": "others"}}))
     assert call(suite, tmp_path, **options) == 2 and len(inside) == 3
     assert all("other photographs" in r["error"] for r in read(tmp_path)["runs"] if r["scene"] == "one")
 
@@ -193,7 +195,7 @@ def test_stopped_and_gone_on(suite, tmp_path, monkeypatch):
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130 and "same command goes on" in error and "Traceback" not in error, error
-    reached = json.loads((run / results.METRICS).read_text())["iterations"]
+    reached = checkpoint.load_latest(run)[1]["step"]
     assert reached > 0 and read(tmp_path / "out")["runs"][0]["status"] == "missing"
 
     # as if the plan had been to end soon after that
@@ -206,8 +208,6 @@ def test_stopped_and_gone_on(suite, tmp_path, monkeypatch):
 
 def retold(path, **changes):
     """Change the settings in a checkpoint."""
-    from rgs_mi.fit import checkpoint
-
     arrays, meta = checkpoint._load(path)
     meta["settings"] |= changes
     checkpoint.save(path.parents[1], arrays, meta)
@@ -247,7 +247,7 @@ from rgs_mi.core.interrupt import GracefulInterrupt
 def wait(path):
     with GracefulInterrupt() as interrupt:
         path.write_text("waiting")
-        while not interrupt.requested:
+        while interrupt.signal is None:
             time.sleep(0.02)
     path.write_text("saved")
 

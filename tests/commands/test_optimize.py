@@ -1,18 +1,22 @@
 """The command line: what a run leaves behind, going on after a crash, and mistakes that cost one line each."""
 
 import json
+import shutil
 import signal
+import subprocess
 
 import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
 
+from rgs_mi import report
 from rgs_mi.core.errors import UserError
 from rgs_mi.fit import checkpoint
+from rgs_mi.fit.scene import FitScene
 from rgs_mi.fit.trainer import Fit
 
-from runs import PATIENCE, SMALL, assert_renders_as_written, start_script, wait_for
+from runs import PATIENCE, ROOT, SMALL, assert_renders_as_written, start, start_script, wait_for
 
 SHOWN = ("psnr", "ssim", "lpips", "normal_mae_deg", "surfels", "iterations", "train_seconds", "render_fps", "peak_rss_mb")
 
@@ -176,8 +180,86 @@ def test_resume_after_a_crash(inputs, tmp_path, monkeypatch, capsys):
         fit(*inputs, tmp_path, overrides=[*SMALL, "sh_order=0"], resume=True)
     with pytest.raises(UserError, match="room is None in the checkpoint and can't change"):
         fit(*inputs, tmp_path, overrides=[*SMALL, "room=4"], resume=True)
-    fit(*inputs, tmp_path, overrides=[*SMALL, "iterations=2"])  # a finished run may be overwritten
-    assert metrics(tmp_path)["iterations"] == 2
+
+
+def test_a_finished_run_is_moved_aside(inputs, tmp_path, capsys):
+    out = tmp_path / "run"
+    fit(*inputs, out, overrides=[*SMALL, "iterations=3"])
+    before = {path.relative_to(out): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    with pytest.raises(UserError, match="nowhere"):
+        fit(inputs[0], tmp_path / "nowhere", out)
+    assert metrics(out)["iterations"] == 3
+    fit(*inputs, out, overrides=[*SMALL, "iterations=2"])
+    assert metrics(out)["iterations"] == 2
+    assert f"{out} holds a run: it is {tmp_path / 'run.1'} now" in capsys.readouterr().err
+    aside = {p.relative_to(tmp_path / "run.1"): p.read_bytes() for p in (tmp_path / "run.1").rglob("*") if p.is_file()}
+    assert aside == before
+
+    (out / "metrics.json").write_text("{")  # damaged: with its checkpoints it could still be gone on with
+    with pytest.raises(UserError, match="unfinished run"):
+        fit(*inputs, out, overrides=[*SMALL, "iterations=1"])
+
+
+def test_what_is_fitted_is_not_overwritten(inputs, tmp_path):
+    scene, data = inputs
+    (tmp_path / "scene.xml").write_text(scene.read_text())
+    with pytest.raises(UserError, match="holds the scene that is fitted"):
+        fit(tmp_path / "scene.xml", data, tmp_path)
+    (tmp_path / "object.xml").write_text(scene.read_text())
+    (tmp_path / "report.html").touch()
+    with pytest.raises(UserError, match="holds a run, and what it was fitted to"):
+        fit(tmp_path / "object.xml", data, tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["object.xml", "report.html", "scene.xml"]
+
+
+def test_only_to_the_same_photographs_and_by_the_same_format(inputs, tmp_path):
+    """NeRF Synthetic's scenes have the same names and sizes: what they show tells them apart."""
+    scene, data = inputs
+    other = tmp_path / "data"
+    shutil.copytree(data, other)
+    shutil.copy(other / "train" / "r_0.png", other / "train" / "r_1.png")
+    run = fit(scene, data, tmp_path / "run", overrides=[*SMALL, "iterations=3"])
+    _, meta = checkpoint.load_latest(run)
+    assert meta["digests"] == metrics(run)["digests"] and metrics(run)["format"] == checkpoint.FORMAT
+    with pytest.raises(UserError, match="data: not the photographs of the checkpoint"):
+        fit(scene, other, run, resume=True)
+    arrays, meta = checkpoint.load_latest(run)
+    for wrong, message in (
+        ({"format": checkpoint.FORMAT + 1}, "format 2 of a newer version"),
+        ({"format": None}, "format None of another version"),
+        ({"format": "x" * 99 + "\n"}, "of another version"),
+        ({"digests": None}, "not one of a fit"),
+        ({"settings": 3}, "not one of a fit"),
+        ({"extent": "wide"}, "not one of a fit"),
+    ):
+        checkpoint.save(run, arrays, meta | wrong)
+        with pytest.raises(UserError, match=message):
+            fit(scene, data, run, resume=True)
+    checkpoint.save(run, {}, meta)
+    with pytest.raises(UserError, match="not one of a fit"):
+        fit(scene, data, run, resume=True)
+
+
+def test_two_at_once(inputs, tmp_path):
+    """The second is told whose the folder is, and the first goes on."""
+    command = ["optimize.py", inputs[0], "--data", inputs[1], "--out", tmp_path / "run"]
+    first = start_script(*command, "--set", "initialization.surfels=300", "--set", "iterations=1000000")
+    wait_for(lambda: any((tmp_path / "run" / "checkpoints").glob("step_*.npz")), first)
+    second = start_script(*command, "--resume")
+    out, error = second.communicate(timeout=PATIENCE)
+    assert second.returncode == 2 and error.count("\n") == 1, error
+    assert f"run is in use by process {first.pid} on " in error
+    assert first.poll() is None and any((tmp_path / "run" / "checkpoints").glob("step_*.npz"))
+    first.kill()
+    first.communicate()
+
+
+def test_a_run_is_called_by_the_name_of_its_photographs(inputs, monkeypatch):
+    scene, data = inputs
+    for given in (data, data / "train" / "..", f"{data}/"):
+        assert FitScene.load(scene, given).name == "ball"
+    monkeypatch.chdir(data / "train")
+    assert FitScene.load(scene, "..").name == "ball" and FitScene.load(scene, "/").name == "object"
 
 
 def test_nothing_to_resume(inputs, tmp_path, capsys):
@@ -185,19 +267,27 @@ def test_nothing_to_resume(inputs, tmp_path, capsys):
     assert "from the beginning" in capsys.readouterr().err
 
 
-def test_full_disk_does_not_end_the_fit(inputs, tmp_path, monkeypatch):
-    save, calls = checkpoint.save, []
+def test_full_disk_does_not_end_the_fit(inputs, tmp_path, monkeypatch, capsys):
+    """Neither in its middle nor at its end, and it is told once; the last good checkpoint stays."""
+    save, calls, full = checkpoint.save, [], []
 
-    def full_at_third(*arguments):
-        calls.append(1)
-        if len(calls) == 3:
+    def full_for_a_while(*arguments):
+        calls.append(arguments[2]["step"])
+        if calls[-1] in full:
             raise UserError("no space")
         return save(*arguments)
 
-    monkeypatch.setattr(checkpoint, "save", full_at_third)
-    with pytest.warns(UserWarning, match="no space"):
-        fit(*inputs, tmp_path)
-    assert metrics(tmp_path)["iterations"] == 20
+    monkeypatch.setattr(checkpoint, "save", full_for_a_while)
+    full += range(3, 8)
+    with pytest.warns(UserWarning, match="no space") as told:
+        fit(*inputs, tmp_path / "middle")
+    assert len(told) == 1 and capsys.readouterr().err == "checkpoints are written again\n"
+    assert calls[3:9] == [3, 4, 5, 6, 7, 8] and checkpoint.load_latest(tmp_path / "middle")[1]["step"] == 20
+    full += range(8, 100)
+    with pytest.warns(UserWarning, match="no space") as told:
+        fit(*inputs, tmp_path / "end")
+    assert len(told) == 1 and checkpoint.load_latest(tmp_path / "end")[1]["step"] == 2
+    assert [metrics(tmp_path / name)["iterations"] for name in ("middle", "end")] == [20, 20]
 
 
 @pytest.mark.parametrize("failures", [1, 9, 10])
@@ -235,6 +325,16 @@ def test_numbers_that_are_not_finite_do_not_replace_a_checkpoint(inputs, tmp_pat
     assert checkpoint.load_latest(tmp_path)[1]["step"] == 4
 
 
+def test_a_run_has_not_ended_before_its_page_is_there(inputs, tmp_path, monkeypatch):
+    def full(*_):
+        raise UserError("no space")
+
+    monkeypatch.setattr(report, "write", full)
+    with pytest.raises(UserError, match="no space"):
+        fit(*inputs, tmp_path, overrides=[*SMALL, "iterations=1"])
+    assert not (tmp_path / "metrics.json").exists()
+
+
 def test_no_test_views(inputs, tmp_path):
     scene, data = inputs
     copy = tmp_path / "data"
@@ -246,30 +346,42 @@ def test_no_test_views(inputs, tmp_path):
     assert (tmp_path / "run" / "contact_sheet.png").is_file()
 
 
-def test_interrupt(inputs, tmp_path):
-    scene, data = inputs
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_stopped(inputs, tmp_path, number):
+    """Ctrl-C saves and evaluates; what sends SIGTERM kills soon after, so that there is no more than saving. Each has its code,
+    and the same command goes on."""
+    command = ["optimize.py", inputs[0], "--data", inputs[1], "--out", tmp_path / "run"]
     process = start_script(
-        "optimize.py",
-        scene,
-        "--data",
-        data,
-        "--out",
-        tmp_path,
-        "--set",
-        "iterations=1000000",
-        "--set",
-        "initialization.surfels=300",
-        "--set",
-        "checkpoint_seconds=0",
+        *command, "--set", "iterations=1000000", "--set", "initialization.surfels=300", "--set", "checkpoint_seconds=0"
     )
-    wait_for(lambda: any((tmp_path / "checkpoints").glob("step_*[1-9].npz")), process)
-    process.send_signal(signal.SIGINT)
+    wait_for(lambda: any((tmp_path / "run" / "checkpoints").glob("step_*[1-9].npz")), process)
+    process.send_signal(number)
     out, error = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 0, error
-    assert "--resume" in out and "Traceback" not in error
-    figures = metrics(tmp_path)
-    assert not figures["finished"]
-    assert checkpoint.load_latest(tmp_path)[1]["step"] == figures["iterations"] > 0
+    assert process.returncode == 128 + number and "Traceback" not in error, error
+    assert error.splitlines()[-1] == "stopped at 0%; go on with the same command and --resume"
+    assert (tmp_path / "run" / "metrics.json").exists() == (number == signal.SIGINT)
+    assert not (tmp_path / "run" / ".lock").exists()
+    step = checkpoint.load_latest(tmp_path / "run")[1]["step"]
+    assert step > 0
+    if number == signal.SIGINT:
+        figures = metrics(tmp_path / "run")
+        assert not figures["finished"] and figures["iterations"] == step
+
+
+def test_telling_does_not_end_it(inputs, tmp_path):
+    """A full disk below 2> run.log and > run.txt, and a reader that is gone: the fit goes on, and ends well."""
+    command = [ROOT / "scripts" / "optimize.py", inputs[0], "--data", inputs[1], "--set", "iterations=3"]
+    command += ["--set", "initialization.surfels=300", "--set", "learning_rates.room=[0,0]"]
+    with open("/dev/full", "w") as full:
+        process = start(*command, "--out", tmp_path / "full", stdout=full, stderr=full)
+    gone = start(*command, "--out", tmp_path / "gone", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    for stream in (gone.stdout, gone.stderr):
+        stream.close()
+    for name, ended in (("full", process), ("gone", gone)):
+        assert ended.wait(timeout=PATIENCE) == 0 and metrics(tmp_path / name)["finished"]
+    with open("/dev/full", "w") as full:
+        process = start(*command, "--set", "iterations=none", stdout=full, stderr=full)
+    assert process.wait(timeout=PATIENCE) == 2
 
 
 def test_mistakes(inputs, tmp_path):

@@ -1,10 +1,13 @@
 """Suites: which scenes there are, what is fitted, workers, failures, and the paper's tables."""
 
 import csv
+import gc
 import json
 import os
 import signal
+import struct
 import time
+from multiprocessing.connection import Connection
 
 import drjit as dr
 import pytest
@@ -12,6 +15,7 @@ import pytest
 from rgs_mi.commands import jobs, suite
 from rgs_mi.core import subprocesses
 from rgs_mi.core.errors import UserError
+from rgs_mi.fit import checkpoint
 from rgs_mi.report import paper_results, results, tables
 
 from captures import photographs, write_colmap, write_nerfstudio, write_nero
@@ -124,9 +128,27 @@ def test_goes_on(captures, tmp_path, inside, capsys):
     with open(out / "suite.csv", newline="") as stream:
         assert [float(r["psnr"]) for r in csv.DictReader(stream)] == [r["psnr"] for r in first["runs"]]
 
-    with pytest.warns(UserWarning, match="other settings"):
-        call(captures, out, scenes=["car"], overrides=[*SMALL, "iterations=2"])
+    call(captures, out, scenes=["car"], overrides=[*SMALL, "iterations=2"])
     assert inside[2:] == ["car"] and [(r["scene"], r["iterations"]) for r in read(out)["runs"]] == [("car", 2)]
+    assert json.loads((out / "car.1" / "metrics.json").read_text()) == metrics  # what was finished is not lost
+    (out / "car" / "metrics.json").unlink()  # nor is what was begun
+    with pytest.warns(UserWarning, match=r"car had other settings: it is .*car\.2 now"):
+        call(captures, out, scenes=["car"], overrides=[*SMALL, "iterations=3"])
+    assert checkpoint.load_latest(out / "car.2")[1]["step"] == 2
+
+
+DAMAGES = ["{", "[1]", '{"finished": true}', '{"finished": true, "settings": 3}', "\xff", "[" * 100000]
+
+
+def test_a_damaged_run_ends_no_suite(captures, tmp_path, inside):
+    """Its checkpoints are gone on with."""
+    out = tmp_path / "out"
+    call(captures, out, scenes=["helmet"])
+    for content in DAMAGES:
+        (out / "helmet" / "metrics.json").write_text(content)
+        assert results.saved_figures(out / "helmet") is None
+    assert call(captures, out, scenes=["helmet"]) == 0 and [r["status"] for r in read(out)["runs"]] == ["finished"]
+    assert inside == ["helmet"] * 2
 
 
 def test_failures_are_told(captures, tmp_path, inside, capsys):
@@ -136,7 +158,8 @@ def test_failures_are_told(captures, tmp_path, inside, capsys):
     (root / "car").symlink_to(captures[1] / "car")
     out = tmp_path / "out"
     (out / "car").mkdir(parents=True)
-    (out / "car" / "photographs.sha256").write_text("others")
+    others = {"finished": True, "settings": {}, "digests": {"photographs": "others"}}
+    (out / "car" / "metrics.json").write_text(json.dumps(others))
     assert call((captures[0], root), out) == 2 and inside == []
     rows = read(out)["runs"]
     assert [r["status"] for r in rows] == ["failed"] * 2
@@ -144,7 +167,7 @@ def test_failures_are_told(captures, tmp_path, inside, capsys):
     assert "malformed JSON" in (out / "suite.md").read_text() and "malformed JSON" in (out / "suite.html").read_text()
     assert "bad: " in capsys.readouterr().err
 
-    (out / "car" / "photographs.sha256").unlink()
+    (out / "car" / "metrics.json").unlink()
     assert call((captures[0], root), out) == 1 and inside == ["car"]
     assert [r["status"] for r in read(out)["runs"]] == ["failed", "finished"]
 
@@ -176,8 +199,7 @@ def test_stopped_and_gone_on(captures, tmp_path, monkeypatch):
     _, error = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130 and "same command goes on" in error and "Traceback" not in error, error
     for run in runs:
-        figures = json.loads((run / results.METRICS).read_text())
-        assert figures["iterations"] > 0 and not figures["finished"]
+        assert checkpoint.load_latest(run)[1]["step"] > 0 and not (run / results.METRICS).exists()
     assert [r["status"] for r in read(tmp_path / "out")["runs"]] == ["missing"] * 2
 
 
@@ -201,6 +223,19 @@ def test_workers(monkeypatch):
 
 
 # ---- Tables ----
+
+
+def half_a_word():
+    """Die in the middle of sending what came out."""
+    for found in gc.get_objects():
+        if isinstance(found, Connection) and not found.closed and found.writable:
+            os.write(found.fileno(), struct.pack("!i", 1000) + b"half")
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_worker_that_dies_in_the_middle_of_a_word():
+    with pytest.raises(UserError, match="killed by SIGKILL, perhaps for want of memory"):
+        subprocesses.apart(half_a_word)
 
 
 def test_data_sets_by_name():

@@ -1,10 +1,11 @@
 """What a person sees of errors and warnings: a line each."""
 
+import signal
 import warnings
 
 import pytest
 
-from rgs_mi.core.errors import UserError, run_main
+from rgs_mi.core.errors import Stopped, UserError, run_main
 
 
 def outcome(main, capsys):
@@ -30,3 +31,33 @@ def test_warnings_are_one_line_inside_a_command_only(capsys):
         found = outcome(lambda: warnings.warn("3 views\n left out", stacklevel=1), capsys)
     assert found == (None, "warning: 3 views left out\n")
     assert warnings.showwarning is before
+
+
+def test_a_line_is_a_line(capsys):
+    """Names of files may hold newlines, what terminals obey, and bytes that are no text."""
+    error = UserError("a\nb\x1b[2J\udcff é 日: no file")
+    assert str(error) == r"a\nb\x1b[2J\udcff é 日: no file"
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        assert outcome(lambda: warnings.warn("x\x07\ny", stacklevel=1), capsys)[1] == "warning: x\\x07 y\n"
+
+
+def test_signals_have_their_codes(capsys):
+    before = signal.getsignal(signal.SIGTERM)
+    assert outcome(lambda: signal.raise_signal(signal.SIGTERM), capsys) == (143, "interrupted\n")
+    assert signal.getsignal(signal.SIGTERM) is before
+
+    def stop():
+        raise Stopped(signal.SIGINT, "stopped at 3%")
+
+    assert outcome(stop, capsys) == (130, "stopped at 3%\n")
+
+
+def test_out_of_memory_is_a_line(capsys):
+    def allocate():
+        raise MemoryError("Unable to allocate 9 GiB")
+
+    assert outcome(allocate, capsys) == (
+        2,
+        "error: out of memory (Unable to allocate 9 GiB): use fewer or smaller photographs\n",
+    )

@@ -9,6 +9,7 @@ import threading
 import pytest
 
 from rgs_mi.core import progress
+from rgs_mi.core.errors import Stopped
 from rgs_mi.core.interrupt import GracefulInterrupt
 from rgs_mi.core.progress import Progress
 
@@ -96,17 +97,28 @@ def test_error_leaves_the_terminal_clean():
     assert shown.rindex("Traceback") > shown.rindex("42%")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_interrupt(number, capfd):
     before = signal.getsignal(number)
     with GracefulInterrupt() as interrupt:
-        assert not interrupt.requested
+        assert interrupt.signal is None
         signal.raise_signal(number)
-        assert interrupt.requested
-        with pytest.raises(KeyboardInterrupt):
+        assert interrupt.signal == number
+        with pytest.raises(Stopped) as stop:
             signal.raise_signal(number)
+    assert stop.value.code == 128 + number
     assert signal.getsignal(number) is before
     assert capfd.readouterr().err.count("stopping after this step") == 1
+
+
+def test_a_terminal_that_goes_is_no_matter_below_nohup():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with GracefulInterrupt() as interrupt:
+            signal.raise_signal(signal.SIGHUP)
+        assert interrupt.signal is None
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_interrupt_elsewhere():
@@ -114,9 +126,9 @@ def test_interrupt_elsewhere():
 
     def work():
         with GracefulInterrupt() as interrupt:
-            seen.append((interrupt.requested, signal.getsignal(signal.SIGINT)))
+            seen.append((interrupt.signal, signal.getsignal(signal.SIGINT)))
 
     thread = threading.Thread(target=work)
     thread.start()
     thread.join()
-    assert seen == [(False, before)] and signal.getsignal(signal.SIGINT) is before
+    assert seen == [(None, before)] and signal.getsignal(signal.SIGINT) is before

@@ -175,7 +175,7 @@ def test_bad_scenes(content, message, tmp_path):
 def test_bad_folders(scene_file, tmp_path):
     with pytest.raises(UserError, match="no scene"):
         path_traced.render_dataset(tmp_path / "missing.xml", tmp_path / "out", **SETTINGS)
-    with pytest.raises(UserError, match="cannot make the folder"):
+    with pytest.raises(UserError, match="can.t be written"):
         path_traced.render_dataset(scene_file, scene_file / "inside_a_file", **SETTINGS)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "photo.png").write_text("precious")

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from rgs_mi.core.errors import UserError
+from rgs_mi.core.files import atomic_file
 from rgs_mi.fit import checkpoint
 
 ARRAYS = {"centers": np.arange(12, dtype=np.float32).reshape(4, 3), "step": np.int64(7), "file": np.zeros((0, 2))}
@@ -35,6 +36,14 @@ def test_round_trip(tmp_path):
         np.testing.assert_array_equal(data["centers"], ARRAYS["centers"])
 
 
+def test_two_may_write_the_same_file(tmp_path):
+    """Their halves have names of their own, also where their processes have the same number; the last one is there in the end."""
+    with atomic_file(tmp_path / "a") as one, atomic_file(tmp_path / "a") as other:
+        one.write(b"one")
+        other.write(b"other")
+    assert os.listdir(tmp_path) == ["a"] and (tmp_path / "a").read_bytes() == b"one"
+
+
 def test_none(tmp_path):
     assert checkpoint.load_latest(tmp_path) is None
     assert checkpoint.load_latest(tmp_path / "missing") is None
@@ -43,7 +52,7 @@ def test_none(tmp_path):
 def test_keeps_two_and_clears_temporaries(tmp_path):
     for step in (1, 2, 3):
         checkpoint.save(tmp_path, ARRAYS, {"step": step})
-    stale = tmp_path / "checkpoints" / ".step_0000009.npz.1.tmp"
+    stale = tmp_path / "checkpoints" / ".step_0000009.npz.0123456789ab.tmp"
     stale.write_bytes(b"half")
     checkpoint.save(tmp_path, ARRAYS, {"step": 4})
     assert names(tmp_path) == ["step_0000003.npz", "step_0000004.npz"]

@@ -194,10 +194,10 @@ def test_a_checkpoint_keeps_to_its_shader(run):
         optimize(scene, data=data, out=folder, overrides=SMALL, resume=True, quiet=True)
 
 
-def npz(**changes):
+def npz(save=np.savez, **changes):
     """The bytes of a shader's file with other arrays in it."""
     stream = io.BytesIO()
-    np.savez(stream, **{f"weights_{k}": np.zeros(shape, np.float32) for k, shape in enumerate(SHAPES)} | changes)
+    save(stream, **{f"weights_{k}": np.zeros(shape, np.float32) for k, shape in enumerate(SHAPES)} | changes)
     return stream.getvalue()
 
 
@@ -218,6 +218,8 @@ def test_round_trip(tmp_path):
         (npz(weights_1=np.zeros((12, 7))), r"'weights_1' is float64 of shape \(12, 7\), needs floats of shape \(12, 12\)"),
         (npz(weights_2=np.full((3, 12), "a")), "'weights_2' is <U1"),
         (npz(weights_0=np.full((12, 6), np.nan)), "'weights_0' is not finite"),
+        (npz(weights_0=np.zeros((12, 6)), more=np.zeros(1 << 14)), "can't be read .*65536 are the most"),
+        (npz(np.savez_compressed, weights_0=np.zeros((12, 6)), more=np.zeros(1 << 17)), "is no shader"),
     ],
 )
 def test_malformed_files(tmp_path, content, message):

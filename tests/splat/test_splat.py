@@ -187,3 +187,20 @@ def test_nothing_to_draw():
     surfels, camera = sphere_surfels(5), orbit_camera()
     behind = replace(camera, to_world=camera.to_world @ np.diag([1, -1, -1, 1]))
     assert np.all(stacked(render_gbuffer(surfels, behind)) == 0)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e3, 1e6])
+def test_a_world_of_other_units_looks_the_same(scale):
+    """Nothing but the depth knows in which units a world is."""
+    camera, surfels = orbit_camera(0), sphere_surfels(60)
+    here = render_gbuffer(surfels, camera)
+    changed = surfels.numpy() | {name: scale * surfels.numpy()[name] for name in ("centers", "scales")}
+    there = Surfels.from_numpy(changed, two_sided=surfels.two_sided)
+    to_world = camera.to_world.copy()
+    to_world[:3, 3] *= scale
+    found = render_gbuffer(there, replace(camera, to_world=to_world))
+    for name in MAPS:
+        one, other = (np.atleast_2d(getattr(maps, name).numpy()) for maps in (here, found))
+        other = other / {"depth": scale, "square": scale**2}.get(name, 1)
+        apart = np.quantile(abs(other - one), 0.99)  # a pixel may fall on the other side of an edge
+        assert apart < 1e-3 * abs(one).max(), name
