@@ -45,8 +45,8 @@ def patient_streams() -> Iterator[None]:
     their encoding lacks."""
     before = sys.stdout, sys.stderr
     for stream in filter(None, before):
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")
+        if reconfigure := getattr(stream, "reconfigure", None):  # not of a test's stand-in
+            reconfigure(errors="backslashreplace")
     sys.stdout, sys.stderr = (cast(TextIO, stream and _Patient(stream)) for stream in before)
     try:
         yield
