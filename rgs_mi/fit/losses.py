@@ -11,7 +11,7 @@ from ..splat.gbuffer import GBuffer, Maps
 from ..splat.hit import adding
 
 SATURATED = 0.995  # display value from which a photograph only says "at least this bright"
-_WINDOW, _SIGMA = 11, 1.5  # SSIM's Gaussian window
+_WINDOW, _SIGMA, _STRIP = 11, 1.5, 8  # SSIM's Gaussian window, and how many pixels of a column are blurred together
 _C1, _C2 = 0.01**2, 0.03**2
 _SLOPE = 4.0  # change of log radiance per radian up to which it counts by its square
 _APART, _BEND = 0.015, 0.015  # of `minimum_variation`: part of the image's width; radians
@@ -54,37 +54,55 @@ class _Blur(dr.CustomOp):
         self.set_grad_in("channels", self._apply(self.grad_out()))
 
     def _apply(self, channels):
-        width, height = self.size
-        offsets = np.arange(_WINDOW) - _WINDOW // 2
-        weights = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
-        weights /= weights.sum()
-        index = dr.arange(mi.UInt32, width * height)
-        x, y = mi.Int32(index % width), mi.Int32(index // width)
-        for position, extent, stride in ((x, width, 1), (y, height, width)):
-            dr.eval(channels)
-            out = [mi.Float(0)] * len(channels)
-            for offset, weight in zip(offsets.tolist(), weights.tolist()):
-                inside = (position + offset >= 0) & (position + offset < extent)
-                at = mi.UInt32(mi.Int32(index) + offset * stride)
-                out = [dr.fma(dr.gather(mi.Float, c, at, inside), weight, o) for c, o in zip(channels, out)]
-            channels = out
+        (width, height), count = self.size, len(channels)
         dr.eval(channels)
-        return channels
+        index = dr.arange(mi.UInt32, width * height)
+        planes = dr.empty(mi.Float, count * width * height)
+        for k, channel in enumerate(channels):
+            dr.scatter(planes, channel, index + k * (width * height))
+        planes, transposed = _blurred_columns(planes, count, (width, height), width)
+        planes, stride = _blurred_columns(planes, count, (height, width), transposed)
+        at = index // width * stride + index % width
+        return [dr.gather(mi.Float, planes, at + k * (height * stride)) for k in range(count)]
 
     def name(self):
         return "rgs_mi.fit.losses.Blur"
+
+
+def _blurred_columns(planes, count, size, stride):
+    """(``count`` images, one after the other, blurred along their columns and transposed; the floats of a row of these). The
+    images come with ``size`` (width, height) and rows of ``stride`` floats. A lane blurs `_STRIP` pixels of a column, of
+    which neighbours share nearly all that they read."""
+    (width, height), reach = size, _WINDOW // 2
+    weights = np.exp(-0.5 * (np.arange(_WINDOW) - reach) ** 2 / _SIGMA**2)
+    _, *weights = (weights / weights.sum())[reach - 1 :].tolist()
+    strips = -(-height // _STRIP)
+    lane = dr.arange(mi.UInt32, count * width * strips)
+    x, strip, image = lane % width, lane // width % strips, lane // (width * strips)
+    column, first = mi.Int32(image * (height * stride) + x), mi.Int32(strip * _STRIP) - reach
+    rows = [first + k for k in range(_STRIP + 2 * reach)]
+    read = [dr.gather(mi.Float, planes, mi.UInt32(column + y * stride), (y >= 0) & (y < height)) for y in rows]
+    blurred = []
+    for k in range(reach, reach + _STRIP):
+        value = weights[0] * read[k]
+        for offset, weight in enumerate(weights[1:], 1):
+            value = dr.fma(weight, read[k - offset] + read[k + offset], value)
+        blurred.append(value)
+    out = dr.empty(mi.Float, count * width * strips * _STRIP)
+    dr.scatter(out, mi.ArrayXf(*blurred), (image * width + x) * strips + strip)
+    dr.eval(out)
+    return out, strips * _STRIP
 
 
 def ssim(image: "mi.Color3f", target: "mi.Color3f", size: tuple[int, int]) -> "mi.Float":
     """Return the mean structural similarity of two images of ``size`` (width, height), with an 11 × 11 Gaussian window of σ
     1.5 (Wang et al. 2004); differentiable in the first."""
     with dr.suspend_grad():
-        blurred = dr.custom(_Blur, [*target, *(target * target)], size)
-    mu_y, yy = mi.Color3f(*blurred[:3]), mi.Color3f(*blurred[3:])
-    blurred = dr.custom(_Blur, [*image, *(image * image), *(image * target)], size)
-    mu_x, xx, xy = (mi.Color3f(*blurred[3 * k : 3 * k + 3]) for k in range(3))
-    var_x, var_y, cov = xx - mu_x * mu_x, yy - mu_y * mu_y, xy - mu_x * mu_y
-    value = ((2 * mu_x * mu_y + _C1) * (2 * cov + _C2)) / ((mu_x * mu_x + mu_y * mu_y + _C1) * (var_x + var_y + _C2))
+        mu_y = mi.Color3f(*dr.custom(_Blur, list(target), size))
+    blurred = dr.custom(_Blur, [*image, *(image * image + target * target), *(image * target)], size)
+    mu_x, squares, xy = (mi.Color3f(*blurred[3 * k : 3 * k + 3]) for k in range(3))
+    means, product = mu_x * mu_x + mu_y * mu_y, mu_x * mu_y  # of variances only the sum is asked for
+    value = ((2 * product + _C1) * (2 * (xy - product) + _C2)) / ((means + _C1) * (squares - means + _C2))
     return dr.mean(dr.mean(value))
 
 
