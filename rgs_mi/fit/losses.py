@@ -123,21 +123,29 @@ def mask(alpha: "mi.Float", target: "mi.Float") -> "mi.Float":
 
 
 class _Shifted(dr.CustomOp):
-    """A list of images as others see them, each pixel what ``offset`` pixels further has; zero beyond the ends. Its adjoint is
-    a gather, too, where that of a plain gather would add atomically."""
+    """A list of images as others see them, once for each of ``offsets``, one after the other: each pixel what so many pixels
+    further has, zero beyond the ends. Its adjoint is a gather, too, where that of a plain gather would add atomically."""
 
-    def eval(self, channels, offset):
-        self.offset = offset
-        return self._apply(channels, offset)
+    def eval(self, channels, offsets):
+        self.offsets = offsets
+        return self._apply(channels)
 
     def forward(self):
-        self.set_grad_out(self._apply(self.grad_in("channels"), self.offset))
+        self.set_grad_out(self._apply(self.grad_in("channels")))
 
     def backward(self):
-        self.set_grad_in("channels", self._apply(self.grad_out(), -self.offset))
+        adjoint = list(self.grad_out())
+        dr.eval(adjoint)
+        count = len(adjoint) // len(self.offsets)
+        parts = [self._shift(adjoint[k * count : (k + 1) * count], -offset) for k, offset in enumerate(self.offsets)]
+        self.set_grad_in("channels", [sum(values, mi.Float(0)) for values in zip(*parts)])
 
-    def _apply(self, channels, offset):
+    def _apply(self, channels):
         dr.eval(channels)
+        return [value for offset in self.offsets for value in self._shift(channels, offset)]
+
+    @staticmethod
+    def _shift(channels, offset):
         count = dr.width(channels)
         at = dr.arange(mi.Int32, count) + offset
         inside = (at >= 0) & (at < count)
@@ -147,10 +155,10 @@ class _Shifted(dr.CustomOp):
         return "rgs_mi.fit.losses.Shifted"
 
 
-def _neighbors(image, size):
-    """What the pixels to the left, to the right, above and below have of an ``image`` (a list of channels)."""
-    kind = type(image)
-    return [kind(*dr.custom(_Shifted, list(image), offset)) for offset in (-1, 1, -size[0], size[0])]
+def _beside(image, offsets):
+    """What the pixels so many further on (row-major) have of an ``image`` (a list of channels), for each of ``offsets``."""
+    kind, values = type(image), dr.custom(_Shifted, list(image), offsets)
+    return [kind(*values[k : k + len(image)]) for k in range(0, len(values), len(image))]
 
 
 def _interior(gbuffer):
@@ -173,7 +181,7 @@ def depth_normal_consistency(gbuffer: GBuffer, camera: Camera) -> "mi.Float":
     (width, height), m, inner = gbuffer.size, gbuffer.all, _interior(gbuffer)
     rays = pixel_rays(camera, dr.arange(mi.UInt32, width * height))
     point = rays * (m.depth / dr.select(m.alpha > 0.5, m.alpha, 1))  # relative to the camera, world space
-    left, right, above, below = _neighbors(point, gbuffer.size)
+    left, right, above, below = _beside(point, (-1, 1, -width, width))
     unit = lambda v: dr.normalize(dr.select(inner, v, mi.Vector3f(0, 0, 1)))
     n, n_depth = unit(m.normal), unit(dr.cross(below - above, right - left))
     return dr.sum(dr.select(inner, 1 - dr.dot(n, n_depth), 0)) / (width * height)
@@ -192,7 +200,7 @@ def normal_smoothness(gbuffer: GBuffer, reflective: np.ndarray, crease: float = 
     the object is let be."""
     inner, here = _interior(gbuffer), gbuffer.all.normal
     total, pairs = mi.Float(0), mi.Float(0)
-    _, right, _, below = _neighbors(here, gbuffer.size)
+    right, below = _beside(here, (1, gbuffer.size[0]))
     for axis, beside in ((1, right), (0, below)):
         counted = inner & (as_float(reflective & np.roll(reflective, -1, axis)) > 0)  # what is rolled in is not interior
         d2 = dr.squared_norm(beside - here)
