@@ -25,6 +25,7 @@ from ..shading import deferred, prefilter
 from ..shading.indirect import Indirect
 from ..splat import composite, gbuffer
 from ..splat.intersect import TileIntersections
+from ..surfels import surfels
 
 #: Stage -> its functions: (where they are looked up, name).
 STAGES = {
@@ -43,7 +44,7 @@ STAGES = {
     ),
     "shading, back": ((gbuffer._Planes, "backward"), (composite, "_gather_image")),
     "backward": ((composite.Composite, "backward"),),
-    "projection, back": ((Gradients, "add"),),
+    "projection, back": ((Gradients, "add"), (surfels._Split, "backward")),
     "density control": ((DensityControl, "note_reflective"), (DensityControl, "refine")),
     "optimizer": ((drjit.opt.Optimizer, "step"),),
     "cameras": ((Cameras, "see"), (Cameras, "step")),

@@ -8,7 +8,7 @@ from ..core.arrays import as_float
 from ..core.camera import Camera, pixel_rays
 from ..shading.deferred import COVERED
 from ..splat.gbuffer import GBuffer, Maps
-from ..splat.hit import adding
+from ..surfels.surfels import columns_of
 
 SATURATED = 0.995  # display value from which a photograph only says "at least this bright"
 _WINDOW, _SIGMA, _STRIP = 11, 1.5, 8  # SSIM's Gaussian window, and how many pixels of a column are blurred together
@@ -281,15 +281,15 @@ def environment_total_variation(log_radiance: "mi.TensorXf") -> "mi.Float":
     polar, azimuthal = np.pi / (rows - 1), 2 * np.pi / columns  # angles from texel to texel
     index = dr.arange(mi.UInt32, rows * columns)
     row, column = index // columns, index % columns
-    at = lambda i, active: dr.gather(mi.Color3f, log_radiance.array, i, active, mode=adding(3 * rows * columns))
     length = lambda d: dr.sum(dr.sqrt(dr.square(d) + _SLOPE**2) - _SLOPE)
     sine = dr.sin(mi.Float(row) * polar)
     ring = (row > 0) & (row + 1 < rows)  # the poles are points
-    here = at(index, True)
-    right = at(dr.select(column + 1 < columns, index + 1, index + 1 - columns), ring)
-    along = (right - here) / dr.select(ring, azimuthal * sine, 1)
+    here = mi.Color3f(*columns_of([log_radiance.array], [3]))
+    beside, around, below = _beside(here, (1, 1 - columns, columns))
+    right = dr.select(column + 1 < columns, beside, around)
+    along = dr.select(ring, right - here, 0) / dr.select(ring, azimuthal * sine, 1)
     middle = dr.sin((mi.Float(row) + 0.5) * polar)
-    down = (at(index + columns, row + 1 < rows) - here) / polar
+    down = (below - here) / polar
     total = dr.select(ring, length(along) * sine, 0) + dr.select(row + 1 < rows, length(down) * middle, 0)
     return dr.sum(total) * (polar * azimuthal / (4 * np.pi))
 

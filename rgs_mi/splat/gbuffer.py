@@ -117,6 +117,7 @@ def render_gbuffer(
 ) -> GBuffer:
     """Splat ``surfels`` into ``camera``; differentiable in all fields. ``means2d_offset`` is that of `project`; ``full`` asks
     for the maps that only regularizers want, too."""
+    surfels = surfels.split()
     projected = project(surfels, camera, means2d_offset)
     delta = surfels.column(mi.Vector3f, "delta_normal")
     features = [
