@@ -20,6 +20,7 @@ from ..splat.composite import Layout, composite
 from ..splat.intersect import isect_tiles
 from ..splat.project import project
 from ..surfels.surfels import Surfels, rotation_from_normal
+from . import step_profile
 from .optimize import start
 
 STAGES = ("lists", "forward", "backward")
@@ -135,7 +136,7 @@ def step(
     path: str | Path, data: str | Path | None, count: int = 15_000, steps: int = 20, overrides: Sequence[str] = ()
 ) -> None:
     """Print the time of a fit's step on one view at full resolution with ``count`` surfels, and the kernels that were
-    compiled after warm-up (which a fit of constant size should not need)."""
+    compiled after warm-up (which a fit of constant size should not need); and of each of its stages what it takes."""
     scene = FitScene.load(path, data)
     settings = scene.settings(
         None,
@@ -161,3 +162,4 @@ def step(
         f"{len(fit.model)} surfels, {width} x {height} pixels: {milliseconds:.1f} ms a step, "
         f"{len(kernels) / (steps + 1):.0f} kernels a step, {compiled} compiled after warm-up"
     )
+    print(step_profile.table(step_profile.profile(fit.step, steps)))

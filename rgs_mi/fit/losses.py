@@ -8,10 +8,10 @@ from ..core.arrays import as_float
 from ..core.camera import Camera, pixel_rays
 from ..shading.deferred import COVERED
 from ..splat.gbuffer import GBuffer, Maps
-from ..splat.hit import adding
+from ..surfels.surfels import columns_of
 
 SATURATED = 0.995  # display value from which a photograph only says "at least this bright"
-_WINDOW, _SIGMA = 11, 1.5  # SSIM's Gaussian window
+_WINDOW, _SIGMA, _STRIP = 11, 1.5, 8  # SSIM's Gaussian window, and how many pixels of a column are blurred together
 _C1, _C2 = 0.01**2, 0.03**2
 _SLOPE = 4.0  # change of log radiance per radian up to which it counts by its square
 _APART, _BEND = 0.015, 0.015  # of `minimum_variation`: part of the image's width; radians
@@ -54,37 +54,55 @@ class _Blur(dr.CustomOp):
         self.set_grad_in("channels", self._apply(self.grad_out()))
 
     def _apply(self, channels):
-        width, height = self.size
-        offsets = np.arange(_WINDOW) - _WINDOW // 2
-        weights = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
-        weights /= weights.sum()
-        index = dr.arange(mi.UInt32, width * height)
-        x, y = mi.Int32(index % width), mi.Int32(index // width)
-        for position, extent, stride in ((x, width, 1), (y, height, width)):
-            dr.eval(channels)
-            out = [mi.Float(0)] * len(channels)
-            for offset, weight in zip(offsets.tolist(), weights.tolist()):
-                inside = (position + offset >= 0) & (position + offset < extent)
-                at = mi.UInt32(mi.Int32(index) + offset * stride)
-                out = [dr.fma(dr.gather(mi.Float, c, at, inside), weight, o) for c, o in zip(channels, out)]
-            channels = out
+        (width, height), count = self.size, len(channels)
         dr.eval(channels)
-        return channels
+        index = dr.arange(mi.UInt32, width * height)
+        planes = dr.empty(mi.Float, count * width * height)
+        for k, channel in enumerate(channels):
+            dr.scatter(planes, channel, index + k * (width * height))
+        planes, transposed = _blurred_columns(planes, count, (width, height), width)
+        planes, stride = _blurred_columns(planes, count, (height, width), transposed)
+        at = index // width * stride + index % width
+        return [dr.gather(mi.Float, planes, at + k * (height * stride)) for k in range(count)]
 
     def name(self):
         return "rgs_mi.fit.losses.Blur"
+
+
+def _blurred_columns(planes, count, size, stride):
+    """(``count`` images, one after the other, blurred along their columns and transposed; the floats of a row of these). The
+    images come with ``size`` (width, height) and rows of ``stride`` floats. A lane blurs `_STRIP` pixels of a column, of
+    which neighbours share nearly all that they read."""
+    (width, height), reach = size, _WINDOW // 2
+    weights = np.exp(-0.5 * (np.arange(_WINDOW) - reach) ** 2 / _SIGMA**2)
+    _, *weights = (weights / weights.sum())[reach - 1 :].tolist()
+    strips = -(-height // _STRIP)
+    lane = dr.arange(mi.UInt32, count * width * strips)
+    x, strip, image = lane % width, lane // width % strips, lane // (width * strips)
+    column, first = mi.Int32(image * (height * stride) + x), mi.Int32(strip * _STRIP) - reach
+    rows = [first + k for k in range(_STRIP + 2 * reach)]
+    read = [dr.gather(mi.Float, planes, mi.UInt32(column + y * stride), (y >= 0) & (y < height)) for y in rows]
+    blurred = []
+    for k in range(reach, reach + _STRIP):
+        value = weights[0] * read[k]
+        for offset, weight in enumerate(weights[1:], 1):
+            value = dr.fma(weight, read[k - offset] + read[k + offset], value)
+        blurred.append(value)
+    out = dr.empty(mi.Float, count * width * strips * _STRIP)
+    dr.scatter(out, mi.ArrayXf(*blurred), (image * width + x) * strips + strip)
+    dr.eval(out)
+    return out, strips * _STRIP
 
 
 def ssim(image: "mi.Color3f", target: "mi.Color3f", size: tuple[int, int]) -> "mi.Float":
     """Return the mean structural similarity of two images of ``size`` (width, height), with an 11 × 11 Gaussian window of σ
     1.5 (Wang et al. 2004); differentiable in the first."""
     with dr.suspend_grad():
-        blurred = dr.custom(_Blur, [*target, *(target * target)], size)
-    mu_y, yy = mi.Color3f(*blurred[:3]), mi.Color3f(*blurred[3:])
-    blurred = dr.custom(_Blur, [*image, *(image * image), *(image * target)], size)
-    mu_x, xx, xy = (mi.Color3f(*blurred[3 * k : 3 * k + 3]) for k in range(3))
-    var_x, var_y, cov = xx - mu_x * mu_x, yy - mu_y * mu_y, xy - mu_x * mu_y
-    value = ((2 * mu_x * mu_y + _C1) * (2 * cov + _C2)) / ((mu_x * mu_x + mu_y * mu_y + _C1) * (var_x + var_y + _C2))
+        mu_y = mi.Color3f(*dr.custom(_Blur, list(target), size))
+    blurred = dr.custom(_Blur, [*image, *(image * image + target * target), *(image * target)], size)
+    mu_x, squares, xy = (mi.Color3f(*blurred[3 * k : 3 * k + 3]) for k in range(3))
+    means, product = mu_x * mu_x + mu_y * mu_y, mu_x * mu_y  # of variances only the sum is asked for
+    value = ((2 * product + _C1) * (2 * (xy - product) + _C2)) / ((means + _C1) * (squares - means + _C2))
     return dr.mean(dr.mean(value))
 
 
@@ -105,21 +123,29 @@ def mask(alpha: "mi.Float", target: "mi.Float") -> "mi.Float":
 
 
 class _Shifted(dr.CustomOp):
-    """A list of images as others see them, each pixel what ``offset`` pixels further has; zero beyond the ends. Its adjoint is
-    a gather, too, where that of a plain gather would add atomically."""
+    """A list of images as others see them, once for each of ``offsets``, one after the other: each pixel what so many pixels
+    further has, zero beyond the ends. Its adjoint is a gather, too, where that of a plain gather would add atomically."""
 
-    def eval(self, channels, offset):
-        self.offset = offset
-        return self._apply(channels, offset)
+    def eval(self, channels, offsets):
+        self.offsets = offsets
+        return self._apply(channels)
 
     def forward(self):
-        self.set_grad_out(self._apply(self.grad_in("channels"), self.offset))
+        self.set_grad_out(self._apply(self.grad_in("channels")))
 
     def backward(self):
-        self.set_grad_in("channels", self._apply(self.grad_out(), -self.offset))
+        adjoint = list(self.grad_out())
+        dr.eval(adjoint)
+        count = len(adjoint) // len(self.offsets)
+        parts = [self._shift(adjoint[k * count : (k + 1) * count], -offset) for k, offset in enumerate(self.offsets)]
+        self.set_grad_in("channels", [sum(values, mi.Float(0)) for values in zip(*parts)])
 
-    def _apply(self, channels, offset):
+    def _apply(self, channels):
         dr.eval(channels)
+        return [value for offset in self.offsets for value in self._shift(channels, offset)]
+
+    @staticmethod
+    def _shift(channels, offset):
         count = dr.width(channels)
         at = dr.arange(mi.Int32, count) + offset
         inside = (at >= 0) & (at < count)
@@ -129,10 +155,10 @@ class _Shifted(dr.CustomOp):
         return "rgs_mi.fit.losses.Shifted"
 
 
-def _neighbors(image, size):
-    """What the pixels to the left, to the right, above and below have of an ``image`` (a list of channels)."""
-    kind = type(image)
-    return [kind(*dr.custom(_Shifted, list(image), offset)) for offset in (-1, 1, -size[0], size[0])]
+def _beside(image, offsets):
+    """What the pixels so many further on (row-major) have of an ``image`` (a list of channels), for each of ``offsets``."""
+    kind, values = type(image), dr.custom(_Shifted, list(image), offsets)
+    return [kind(*values[k : k + len(image)]) for k in range(0, len(values), len(image))]
 
 
 def _interior(gbuffer):
@@ -155,7 +181,7 @@ def depth_normal_consistency(gbuffer: GBuffer, camera: Camera) -> "mi.Float":
     (width, height), m, inner = gbuffer.size, gbuffer.all, _interior(gbuffer)
     rays = pixel_rays(camera, dr.arange(mi.UInt32, width * height))
     point = rays * (m.depth / dr.select(m.alpha > 0.5, m.alpha, 1))  # relative to the camera, world space
-    left, right, above, below = _neighbors(point, gbuffer.size)
+    left, right, above, below = _beside(point, (-1, 1, -width, width))
     unit = lambda v: dr.normalize(dr.select(inner, v, mi.Vector3f(0, 0, 1)))
     n, n_depth = unit(m.normal), unit(dr.cross(below - above, right - left))
     return dr.sum(dr.select(inner, 1 - dr.dot(n, n_depth), 0)) / (width * height)
@@ -174,7 +200,7 @@ def normal_smoothness(gbuffer: GBuffer, reflective: np.ndarray, crease: float = 
     the object is let be."""
     inner, here = _interior(gbuffer), gbuffer.all.normal
     total, pairs = mi.Float(0), mi.Float(0)
-    _, right, _, below = _neighbors(here, gbuffer.size)
+    right, below = _beside(here, (1, gbuffer.size[0]))
     for axis, beside in ((1, right), (0, below)):
         counted = inner & (as_float(reflective & np.roll(reflective, -1, axis)) > 0)  # what is rolled in is not interior
         d2 = dr.squared_norm(beside - here)
@@ -266,15 +292,15 @@ def environment_total_variation(log_radiance: "mi.TensorXf") -> "mi.Float":
     polar, azimuthal = np.pi / (rows - 1), 2 * np.pi / columns  # angles from texel to texel
     index = dr.arange(mi.UInt32, rows * columns)
     row, column = index // columns, index % columns
-    at = lambda i, active: dr.gather(mi.Color3f, log_radiance.array, i, active, mode=adding(3 * rows * columns))
     length = lambda d: dr.sum(dr.sqrt(dr.square(d) + _SLOPE**2) - _SLOPE)
     sine = dr.sin(mi.Float(row) * polar)
     ring = (row > 0) & (row + 1 < rows)  # the poles are points
-    here = at(index, True)
-    right = at(dr.select(column + 1 < columns, index + 1, index + 1 - columns), ring)
-    along = (right - here) / dr.select(ring, azimuthal * sine, 1)
+    here = mi.Color3f(*columns_of([log_radiance.array], [3]))
+    beside, around, below = _beside(here, (1, 1 - columns, columns))
+    right = dr.select(column + 1 < columns, beside, around)
+    along = dr.select(ring, right - here, 0) / dr.select(ring, azimuthal * sine, 1)
     middle = dr.sin((mi.Float(row) + 0.5) * polar)
-    down = (at(index + columns, row + 1 < rows) - here) / polar
+    down = (below - here) / polar
     total = dr.select(ring, length(along) * sine, 0) + dr.select(row + 1 < rows, length(down) * middle, 0)
     return dr.sum(total) * (polar * azimuthal / (4 * np.pi))
 

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from ..core.camera import Camera
 from .composite import Layout, composite
+from .hit import PACKET, fetch
 from .intersect import isect_tiles
 from .project import project
 from .tiles import Cutoffs
@@ -54,12 +55,19 @@ class GBuffer:
     @functools.cached_property
     def all(self) -> Maps:
         """The maps of every pixel."""
-        return self.maps(dr.arange(mi.UInt32, self.size[0] * self.size[1]))
+        return self._maps(dr.custom(_Planes, self.image, self._stride))
 
     def maps(self, index: "mi.UInt32") -> Maps:
         """Return the maps at the pixels ``index`` (row-major)."""
-        packets = 5 if self.full else 4
-        m = [v for q in range(packets) for v in dr.gather(mi.Vector4f, self.image, index * packets + q)]
+        return self._maps(fetch(self.image, index, self._stride))
+
+    @property
+    def _stride(self):
+        """Floats in a pixel."""
+        return 5 * PACKET if self.full else 4 * PACKET
+
+    def _maps(self, m):
+        """The maps that pixels' floats ``m`` are."""
         delta, m[11:] = (mi.Vector3f(*m[11:14]), m[14:]) if self.full else (None, m[11:])
         return Maps(
             mi.Color3f(*m[0:3]),
@@ -74,6 +82,32 @@ class GBuffer:
         )
 
 
+class _Planes(dr.CustomOp):
+    """The floats of all pixels, of an image with so many floats a pixel. Each is read once, so that the adjoint writes where that
+    of a plain gather would add atomically."""
+
+    def eval(self, image, stride):
+        self.stride, self.count = stride, dr.width(image) // stride
+        return self._fetch(image)
+
+    def _fetch(self, image):
+        return fetch(image, dr.arange(mi.UInt32, self.count), self.stride)
+
+    def forward(self):
+        self.set_grad_out(self._fetch(self.grad_in("image")))
+
+    def backward(self):
+        adjoint = list(self.grad_out())
+        dr.eval(adjoint)  # otherwise every scatter below would compute them again
+        image, row = dr.empty(mi.Float, self.count * self.stride), dr.arange(mi.UInt32, self.count) * (self.stride // PACKET)
+        for q in range(self.stride // PACKET):
+            dr.scatter(image, mi.Vector4f(*adjoint[PACKET * q : PACKET * (q + 1)]), row + q)
+        self.set_grad_in("image", image)
+
+    def name(self):
+        return "rgs_mi.splat.Planes"
+
+
 def render_gbuffer(
     surfels: "Surfels",
     camera: Camera,
@@ -83,6 +117,7 @@ def render_gbuffer(
 ) -> GBuffer:
     """Splat ``surfels`` into ``camera``; differentiable in all fields. ``means2d_offset`` is that of `project`; ``full`` asks
     for the maps that only regularizers want, too."""
+    surfels = surfels.split()
     projected = project(surfels, camera, means2d_offset)
     delta = surfels.column(mi.Vector3f, "delta_normal")
     features = [

@@ -4,7 +4,7 @@ A surfel is the primitive of 2DGS (Huang et al. 2024): a center, two tangents wi
 Its material has the names of Mitsuba's principled BSDF, so that a cloud of surfels is a principled material.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -42,6 +42,7 @@ class Surfels:
     curvature     K_uu, K_uv, K_vv: how the normal turns across the surfel, radians per √(s_u s_v); see `normal_derivatives`
     two_sided     whether surfels show from behind, with the normal turned to the camera (2DGS); one-sided ones, whose
                   normals point outwards, keep the far side of a closed object from bending its silhouette's normals
+    columns       the columns of all fields where `split` has read them, else None
     """
 
     centers: "mi.TensorXf"
@@ -55,6 +56,7 @@ class Surfels:
     delta_normal: "mi.TensorXf"
     curvature: "mi.TensorXf"
     two_sided: bool = True
+    columns: "dict[str, list[mi.Float]] | None" = None
 
     def __len__(self) -> int:
         return self.centers.shape[0]
@@ -75,14 +77,24 @@ class Surfels:
     def column(self, kind: type, name: str) -> Any:
         """Return the field ``name`` as a Dr.Jit array of type ``kind`` and width N, e.g. ``column(mi.Point3f, "centers")``;
         differentiable."""
-        tensor = getattr(self, name)
         if kind is mi.Float:
-            return self._gather(tensor, 0)
-        return kind(*[self._gather(tensor, k) for k in range(tensor.shape[1])])
+            return self._gather(name, 0)
+        return kind(*[self._gather(name, k) for k in range(getattr(self, name).shape[1])])
 
-    def _gather(self, tensor, k):
+    def split(self) -> "Surfels":
+        """Return the same surfels with `columns`: the derivative of reading them is one kernel for all, and copies what it has
+        where that of each `column` adds number by number. Differentiable; to be called where gradients are as they are where
+        columns are used."""
+        tensors = [getattr(self, name) for name in CHANNELS]
+        values = iter(columns_of([t.array for t in tensors], [t.shape[1] for t in tensors]))
+        return replace(self, columns={name: [next(values) for _ in range(t.shape[1])] for name, t in zip(CHANNELS, tensors)})
+
+    def _gather(self, name, k):
         """Column ``k``. Each number is read once, so that the derivative needs no atomics, nor copies for each thread: these
         would compile the number of surfels into the kernel."""
+        if self.columns is not None:
+            return self.columns[name][k]
+        tensor = getattr(self, name)
         index = dr.arange(mi.UInt32, len(self)) * tensor.shape[1] + k
         return dr.gather(mi.Float, tensor.array, index, mode=dr.ReduceMode.NoConflicts)
 
@@ -137,8 +149,44 @@ class Surfels:
         basis = dr.sh_eval(direction, sh_order(self.sh.shape[1]))
         value = mi.Color3f(0.5)
         for k, Y in enumerate(basis):
-            value += Y * mi.Color3f(*[self._gather(self.sh, 3 * k + c) for c in range(3)])
+            value += Y * mi.Color3f(*[self._gather("sh", 3 * k + c) for c in range(3)])
         return dr.maximum(value, 0)
+
+
+def columns_of(arrays: "list[mi.Float]", channels: list[int]) -> "list[mi.Float]":
+    """Return the columns of ``arrays``, whose rows have so many ``channels`` each, one after the other; differentiable, in one
+    kernel for all of them."""
+    return dr.custom(_Split, arrays, channels)
+
+
+class _Split(dr.CustomOp):
+    """The custom operation of `columns_of`."""
+
+    def eval(self, arrays, channels):
+        self.channels, self.rows = channels, dr.width(arrays[0]) // channels[0]
+        return self._apply(arrays)
+
+    def forward(self):
+        self.set_grad_out(self._apply(self.grad_in("arrays")))
+
+    def backward(self):
+        adjoint = list(self.grad_out())
+        dr.eval(adjoint)
+        columns = iter(adjoint)
+        self.set_grad_in("arrays", [self._join([next(columns) for _ in range(n)]) for n in self.channels])
+
+    def _apply(self, arrays):
+        row = dr.arange(mi.UInt32, self.rows)
+        return [dr.gather(mi.Float, array, row * n + k) for array, n in zip(arrays, self.channels) for k in range(n)]
+
+    def _join(self, columns):
+        """The rows that have these ``columns``."""
+        entry, count = dr.arange(mi.UInt32, self.rows * len(columns)), len(columns)
+        row, own = entry // count, entry % count
+        return sum((dr.gather(mi.Float, column, row, own == k) for k, column in enumerate(columns)), mi.Float(0))
+
+    def name(self):
+        return "rgs_mi.surfels.Split"
 
 
 def sh_order(channels: int) -> int:
