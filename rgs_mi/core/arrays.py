@@ -12,11 +12,18 @@ def as_float(values: np.ndarray) -> "mi.Float":
     Dr.Jit's LLVM backend uses a NumPy array's memory where it lies and compiles its alignment into the kernels that read it:
     since NumPy's varies from array to array, so would the kernels.
     """
-    values = np.asarray(values, np.float32).ravel()
-    memory = np.empty(values.size + _ALIGNMENT // 4, np.float32)
+    values = np.asarray(values, np.float32)
+    memory = aligned(values.size)
+    memory[:] = values.ravel()
+    return mi.Float(memory)
+
+
+def aligned(*shape: int) -> np.ndarray:
+    """Return zeros of this ``shape`` in single precision, in memory aligned as Dr.Jit's own, in which it lets them lie."""
+    size = int(np.prod(shape))
+    memory = np.zeros(size + _ALIGNMENT // 4, np.float32)
     first = -memory.ctypes.data % _ALIGNMENT // 4
-    memory[first : first + values.size] = values
-    return mi.Float(memory[first : first + values.size])
+    return memory[first : first + size].reshape(shape)
 
 
 def as_tensor(values: np.ndarray) -> "mi.TensorXf":

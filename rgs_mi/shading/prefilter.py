@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 from scipy import fft
 
-from ..core.arrays import as_float
+from ..core.arrays import aligned, as_float
 from .tables import lobe
 
 #: Roughness of each level and the most rows of its map; None: as the environment. Level 0 is the mirror: no filter.
@@ -113,19 +113,20 @@ class Prefilter:
         """Texels of all levels together."""
         return sum(r * c for r, c in self.maps)
 
-    def apply(self, texels: np.ndarray) -> np.ndarray:
-        """Filter ``texels`` [rows, columns, 3] float32: return the maps of all levels, [texels, 3]."""
+    def apply(self, texels: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """Filter ``texels`` [rows, columns, 3] float32: return the maps of all levels, [texels, 3], in ``out`` where given."""
         rows, columns = self.size
         parts = [
             _floats(part) for part in _mirrored(np.asarray(fft.rfft(texels.transpose(1, 0, 2), axis=0)))
         ]  # [M, rows / 2, 6]
-        out = [texels.reshape(-1, 3)]
-        for (_, c), pair in zip(self.maps[1:], self.matrices):
+        out = np.empty((self.texels, 3), np.float32) if out is None else out
+        out[: rows * columns] = texels.reshape(-1, 3)
+        for (r, c), pair, offset in zip(self.maps[1:], self.matrices, self.offsets[1:]):
             m = pair[0].shape[0]
             product = _unmirrored(*(matrix @ part[:m] for matrix, part in zip(pair, parts)))
             level = product.view(np.complex64) * self._phase(m, c)[:, None, None] * np.float32(c / columns)
-            out.append(np.asarray(fft.irfft(level, n=c, axis=0)).transpose(1, 0, 2).reshape(-1, 3))
-        return np.concatenate(out)
+            out[offset : offset + r * c].reshape(r, c, 3)[:] = np.asarray(fft.irfft(level, n=c, axis=0)).transpose(1, 0, 2)
+        return out
 
     def transpose(self, adjoint: np.ndarray) -> np.ndarray:
         """Take the ``adjoint`` [texels, 3] of the maps to that of the environment, [rows, columns, 3]: the transpose of
@@ -174,18 +175,18 @@ class _Apply(dr.CustomOp):
 
     def eval(self, texels, operator):
         self.operator = operator
-        return self._pad(operator.apply(texels.numpy().reshape(*operator.size, 3)))
+        return self._filter(texels)
 
     def forward(self):
-        self.set_grad_out(self._pad(self.operator.apply(self.grad_in("texels").numpy().reshape(*self.operator.size, 3))))
+        self.set_grad_out(self._filter(self.grad_in("texels")))
 
     def backward(self):
-        adjoint = np.ascontiguousarray(self.grad_out().numpy().reshape(-1, 4)[:, :3])
-        self.set_grad_in("texels", as_float(self.operator.transpose(adjoint)))
+        self.set_grad_in("texels", as_float(self.operator.transpose(self.grad_out().numpy().reshape(-1, 4)[:, :3])))
 
-    @staticmethod
-    def _pad(values):
-        return as_float(np.pad(values, ((0, 0), (0, 1))))
+    def _filter(self, texels):
+        padded = aligned(self.operator.texels, 4)
+        self.operator.apply(texels.numpy().reshape(*self.operator.size, 3), padded[:, :3])
+        return mi.Float(padded.ravel())
 
     def name(self):
         return "rgs_mi.shading.Prefilter"
