@@ -1,0 +1,188 @@
+"""Depth maps as one surface: a truncated signed distance, the mean over the views (Curless and Levoy 1996).
+
+A voxel at x, of depth z(x) to a camera whose map has the depth d where it sees x, is told
+
+    s = min((d − z) / τ, 1) where s > −1, and 1 where the map has no depth: it looks past the surface there      (16)
+
+with the truncation τ of five voxels (2DGS); what is farther behind the surface it does not see. The surface is where the mean
+of s over the views is zero, between voxels that some view has told of.
+
+Voxels have about the size of a pixel on the surface. Only those within τ of what some view sees are there, in blocks of 8³:
+for the helmet at 400 × 400 pixels a tenth of its box, and at 800 × 800 half as many again of twice as fine a box. A hash of blocks, as
+others have it, is not worth its code, since the mask of the blocks of a whole box is small.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from skimage import measure
+
+from ...core.bounding_box import BoundingBox
+from ...core.camera import Camera, opaque, pixel_rays
+from ...targets.meshes import Mesh, weld
+
+BLOCK = 8  # voxels along a block's edge
+TRUNCATION = 5.0  # τ, voxels
+_MOST_BLOCKS, _MOST_VOXELS = 2**25, 2**26  # in the whole box; in those that are there
+_COARSER = 1.25  # voxels grow by that until both hold
+_SLAB = 8  # blocks whose surface is extracted at a time
+
+
+@dataclass(frozen=True)
+class Volume:
+    """A signed distance in blocks of voxels.
+
+    origin  [3] world-space position of voxel (0, 0, 0)
+    voxel   distance between voxels, world units
+    shape   [3] blocks of the whole box
+    blocks  [B, 3] which of these are there
+    distance, weight  [B, 8, 8, 8] float32: the mean of s of (16), 1 where nothing is known; how many views told of it
+    """
+
+    origin: np.ndarray
+    voxel: float
+    shape: np.ndarray
+    blocks: np.ndarray
+    distance: np.ndarray
+    weight: np.ndarray
+
+
+def fuse(
+    cameras: Sequence[Camera], depths: "Sequence[mi.Float]", box: BoundingBox | None = None, voxel: float | None = None
+) -> Volume | None:
+    """Return the `Volume` of what ``cameras`` see at ``depths`` (of width W · H each, row-major, camera-space z; 0 where they
+    see nothing), within the ``box`` (None: all of it). None where no camera sees anything.
+
+    ``voxel``: world units (None: the median size of a pixel on the surface). Where there is too much surface for memory voxels
+    are larger.
+    """
+    with dr.suspend_grad():
+        lower, upper, footprint = _extent(cameras, depths, box)
+        if not np.isfinite(footprint):
+            return None
+        voxel = voxel or footprint
+        while True:
+            origin = lower - 2 * TRUNCATION * voxel
+            shape = np.ceil((upper - lower + 4 * TRUNCATION * voxel) / (BLOCK * voxel)).astype(int)
+            if shape.prod() <= _MOST_BLOCKS:
+                blocks = _seen_blocks(cameras, depths, box, origin, voxel, shape)
+                if len(blocks) * BLOCK**3 <= _MOST_VOXELS:
+                    break
+            voxel *= _COARSER
+        return Volume(origin, voxel, shape, blocks, *_integrated(cameras, depths, origin, voxel, blocks))
+
+
+def _extent(cameras, depths, box):
+    """(lower corner [3], upper corner [3], median size of a pixel) of all that is seen."""
+    lower, upper, sizes = np.full(3, np.inf), np.full(3, -np.inf), []
+    for camera, depth in zip(cameras, depths):
+        point, z = _points(camera, depth, box)
+        if dr.width(z):
+            lower = np.minimum(lower, dr.ravel(dr.min(point, axis=1)).numpy())
+            upper = np.maximum(upper, dr.ravel(dr.max(point, axis=1)).numpy())
+            sizes.append(np.median(z.numpy()) / max(camera.focal))
+    return lower, upper, float(np.median(sizes)) if sizes else np.nan
+
+
+def _points(camera, depth, box):
+    """(positions, depths) of the pixels that see something in the ``box``."""
+    index = dr.compress(depth > 0)
+    z = dr.gather(mi.Float, depth, index)
+    point = opaque(camera).origin + z * pixel_rays(camera, index)
+    dr.eval(point, z)
+    if box is None:
+        return point, z
+    inside = dr.compress(box.contains(point))
+    return dr.gather(mi.Point3f, point, inside), dr.gather(mi.Float, z, inside)
+
+
+def _seen_blocks(cameras, depths, box, origin, voxel, shape):
+    """[B, 3] the blocks that rays cross within τ of what they see."""
+    seen = dr.zeros(mi.UInt32, int(shape.prod()))
+    lower, size = mi.Point3f(*map(_opaque, origin)), _opaque(BLOCK * voxel)
+    count = [dr.opaque(mi.UInt32, int(n)) for n in shape]
+    for camera, depth in zip(cameras, depths):
+        point, _ = _points(camera, depth, box)
+        away = dr.normalize(point - opaque(camera).origin)
+        for step in np.linspace(-TRUNCATION, TRUNCATION, 5):
+            at = mi.Vector3i(dr.floor((point + _opaque(step * voxel) * away - lower) / size))
+            cell = (mi.UInt32(at.x) * count[1] + mi.UInt32(at.y)) * count[2] + mi.UInt32(at.z)
+            dr.scatter(seen, mi.UInt32(1), cell)
+    return np.argwhere(seen.numpy().reshape(shape))
+
+
+def _integrated(cameras, depths, origin, voxel, blocks):
+    """(distance, weight) of `Volume`: (16)."""
+    corner = mi.Vector3u(np.ascontiguousarray(blocks.T, np.uint32))
+    lane = dr.arange(mi.UInt32, len(blocks) * BLOCK**3)
+    within = mi.Vector3u(lane // BLOCK**2 % BLOCK, lane // BLOCK % BLOCK, lane % BLOCK)
+    index = dr.gather(mi.Vector3u, corner, lane // BLOCK**3) * BLOCK + within
+    point = mi.Point3f(*map(_opaque, origin)) + _opaque(voxel) * mi.Point3f(index)
+    total, weight = dr.zeros(mi.Float, dr.width(lane)), dr.zeros(mi.Float, dr.width(lane))
+    for camera, depth in zip(cameras, depths):
+        signed, known = _signed(camera, depth, point, _opaque(TRUNCATION * voxel))
+        total += dr.select(known, signed, 0)
+        weight += dr.select(known, 1, 0)
+        dr.eval(total, weight)
+    mean = dr.select(weight > 0, total / dr.maximum(weight, 1), 1)
+    return (values.numpy().reshape(-1, BLOCK, BLOCK, BLOCK) for values in (mean, weight))
+
+
+def _signed(camera, depth, point, truncation):
+    """(s of (16), whether the camera tells of it) of each ``point``."""
+    R, origin, focal, principal, lens = opaque(camera)
+    p = R @ (point - origin)
+    x, y = p.x / p.z, p.y / p.z
+    if lens is not None:
+        x, y = lens.distort(x, y)
+    column, row = mi.Int32(dr.floor(x * focal.x + principal.x)), mi.Int32(dr.floor(y * focal.y + principal.y))
+    inside = (p.z > 0) & (column >= 0) & (column < camera.size[0]) & (row >= 0) & (row < camera.size[1])
+    d = dr.gather(mi.Float, depth, mi.UInt32(row * camera.size[0] + column), inside)
+    signed = dr.select(d > 0, dr.minimum((d - p.z) / truncation, 1), 1)
+    return signed, inside & (signed > -1)
+
+
+def _opaque(value):
+    return dr.opaque(mi.Float, float(value))
+
+
+# ---- From the volume to its surface ----
+
+
+def surface(volume: Volume) -> Mesh:
+    """Return the zero of a ``volume`` as a triangle mesh in world space, faces counter-clockwise seen from outside, by marching
+    cubes (Lorensen and Cline 1987), some layers of blocks at a time; empty where there is none."""
+    points, faces, count = [np.zeros((0, 3))], [np.zeros((0, 3), int)], 0
+    for first in range(0, volume.shape[0], _SLAB):
+        vertices, triangles = _extracted(volume, first)
+        points.append(vertices)
+        faces.append(triangles + count)
+        count += len(vertices)
+    points, faces = np.concatenate(points), np.concatenate(faces)
+    return weld(volume.origin + volume.voxel * points, faces)  # layers meet in equal points
+
+
+def _extracted(volume, first):
+    """(vertices [V, 3] in voxels, faces [F, 3]) between the layers of blocks ``first`` and ``first`` + `_SLAB`."""
+    part = (volume.blocks[:, 0] >= first) & (volume.blocks[:, 0] <= first + _SLAB)
+    x, y, z = (volume.blocks[part] - [first, 0, 0]).T
+    distance, known = (np.zeros((_SLAB + 1, BLOCK, volume.shape[1], BLOCK, volume.shape[2], BLOCK), t) for t in "fb")
+    distance += 1
+    distance[x, :, y, :, z, :], known[x, :, y, :, z, :] = volume.distance[part], volume.weight[part] > 0
+    layers = _SLAB * BLOCK + 1  # the first layer of the next blocks as well
+    distance, known = (v.reshape((_SLAB + 1) * BLOCK, *(BLOCK * volume.shape[1:]))[:layers] for v in (distance, known))
+    known[1:, 1:, 1:] = _corners(known)  # scikit-image asks the far corner of a cube whether it counts
+    if not (known[1:, 1:, 1:] & (distance[1:, 1:, 1:] < 0)).any():
+        return np.zeros((0, 3)), np.zeros((0, 3), int)
+    points, faces, _, _ = measure.marching_cubes(distance, 0.0, gradient_direction="descent", mask=known)
+    return points + [first * BLOCK, 0, 0], faces
+
+
+def _corners(known):
+    """Whether all eight corners of each cube between voxels are ``known``."""
+    for axis in range(3):
+        known = np.logical_and(*(np.take(known, range(k, known.shape[axis] - 1 + k), axis) for k in (0, 1)))
+    return known
