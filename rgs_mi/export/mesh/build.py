@@ -15,7 +15,7 @@ from ...targets.meshes import Mesh
 from . import tsdf
 from .depth_maps import depth_map
 from .lookup import look_up
-from .surface import UVMesh, largest_parts, packages, simplified, smoothed, unwrapped
+from .surface import UVMesh, largest_parts, simplified, smoothed, unwrapped
 from .textures import Texels, Textures, textures
 
 _FACES, _MOST_FACES = 1 / 32, 40_000  # of the mesh, over those of the surface voxel by voxel; of any
@@ -47,7 +47,6 @@ def build(
 
     Raises: UserError where cameras see nothing, or a package is missing.
     """
-    packages("fast_simplification", "xatlas")
     with Progress(None, quiet, "meshing") as progress:
         depths = []
         for k, camera in enumerate(cameras):

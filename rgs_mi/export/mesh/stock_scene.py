@@ -109,3 +109,4 @@ def _texture(parent, parameter, name):
     texture = _named(parent, "texture", "bitmap", name=parameter, id=name)
     ET.SubElement(texture, "string", name="filename", value=f"{name}.exr")
     ET.SubElement(texture, "boolean", name="raw", value="true")
+    ET.SubElement(texture, "string", name="format", value="variant")  # single precision, for who differentiates

@@ -11,6 +11,7 @@ from scipy import sparse
 from ...core.errors import UserError
 from ...targets.meshes import Mesh, weld
 
+PACKAGES = ("fast_simplification", "xatlas")
 _LEAST_AREA = 0.01  # of a part that is kept, over that of the largest
 _ROUNDS = 20  # of `smoothed`
 _MOST_TEXELS = 2500  # root of the texels that charts may have in all
@@ -58,10 +59,11 @@ def simplified(mesh: Mesh, faces: int) -> Mesh:
     if len(mesh.faces) <= faces:
         return mesh
     (fast_simplification,) = packages("fast_simplification")
-    points, kept = fast_simplification.simplify(
+    points, triangles = fast_simplification.simplify(
         mesh.vertices.astype(np.float32), mesh.faces.astype(np.int32), target_count=faces
     )
-    return weld(points.astype(float), kept.astype(int))
+    _, first, count = np.unique(np.sort(triangles, axis=1), axis=0, return_index=True, return_counts=True)
+    return weld(points.astype(float), triangles[first[count == 1]].astype(int))  # two of the same corners are a fin
 
 
 def packages(*names: str) -> list[Any]:

@@ -9,7 +9,7 @@ with metallic m and index of refraction η: metals have no diffuse lobe, and Sch
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -71,31 +71,29 @@ class Texels:
 def textures(mesh: UVMesh, texels: Texels, seen: Seen, lit: bool, eta: float) -> Textures:
     """Return the `Textures` of a ``mesh`` from what was ``seen`` at its ``texels``; ``lit`` says whether surfels have no radiance of
     their own, and ``eta`` is their index of refraction. What no camera sees is like the nearest that one does."""
-    known = np.zeros(mesh.size[0] * mesh.size[1], bool)
-    known[texels.index] = seen.known
-    nearest = None
-    if seen.known.any():
-        missing = ~known.reshape(mesh.size[::-1])
-        nearest = ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True)
-
-    def filled(values):
-        image = np.zeros((len(known), values.shape[1]), np.float32)
-        image[texels.index] = values
-        image = image.reshape(*mesh.size[::-1], -1)
-        return image if nearest is None else image[nearest[0], nearest[1]]
-
+    near = nearest(mesh, texels, seen.known if seen.known.any() else None)
+    filled = lambda values: values[near].reshape(*mesh.size[::-1], -1).astype(np.float32)
     base_color, metallic = np.clip(seen.base_color, 0, 1), np.clip(seen.metallic, 0, 1)
     if not lit:
         base_color, metallic = metallic * base_color + (1 - metallic) * ((eta - 1) / (eta + 1)) ** 2, np.ones_like(metallic)
-    normal = np.zeros((len(known), 3), np.float32)
-    normal[texels.index] = np.where(seen.known[:, None], seen.normal, texels.normals)
+    normal = np.where(seen.known[:, None], seen.normal, texels.normals)
     return Textures(
         filled(base_color),
         filled(np.clip(seen.roughness, 0, 1)),
         filled(metallic),
-        normal.reshape(*mesh.size[::-1], 3),
+        normal[nearest(mesh, texels)].reshape(*mesh.size[::-1], 3).astype(np.float32),
         None if lit else filled(seen.radiance),
     )
+
+
+def nearest(mesh: UVMesh, texels: Texels, among: np.ndarray | None = None) -> np.ndarray:
+    """Return for each texel of a texture, [H · W] row-major, which of ``texels`` is the nearest one, of those where ``among`` [T]
+    holds (None: of all)."""
+    number = np.full(mesh.size[0] * mesh.size[1], -1)
+    number[texels.index] = np.arange(len(texels.index)) if among is None else np.where(among, np.arange(len(among)), -1)
+    number = number.reshape(mesh.size[::-1])
+    row, column = ndimage.distance_transform_edt(number < 0, return_distances=False, return_indices=True)
+    return number[row, column].ravel()
 
 
 # ---- Tangent space ----
@@ -103,14 +101,9 @@ def textures(mesh: UVMesh, texels: Texels, seen: Seen, lit: bool, eta: float) ->
 
 def normal_map(mesh: UVMesh, texels: Texels, normal: np.ndarray, frames: "Callable[[UVMesh, Texels], np.ndarray]") -> np.ndarray:
     """Return the ``normal`` [H, W, 3] of a texture, world space, in the ``frames`` of its texels, in [0, 1] as images have it:
-    n / 2 + ½; straight up where there is no texel."""
-    local = np.tile(np.float32([0, 0, 1]), (mesh.size[0] * mesh.size[1], 1))
-    world = normal.reshape(-1, 3)[texels.index]
-    local[texels.index] = unit(np.einsum("tij,tj->ti", frames(mesh, texels), world))
-    known = np.zeros(len(local), bool)
-    known[texels.index] = True
-    nearest = ndimage.distance_transform_edt(~known.reshape(mesh.size[::-1]), return_distances=False, return_indices=True)
-    return (local.reshape(*mesh.size[::-1], 3)[nearest[0], nearest[1]] / 2 + 0.5).astype(np.float32)
+    n / 2 + ½."""
+    local = unit(np.einsum("tij,tj->ti", frames(mesh, texels), normal.reshape(-1, 3)[texels.index]))
+    return (local[nearest(mesh, texels)].reshape(*mesh.size[::-1], 3) / 2 + 0.5).astype(np.float32)
 
 
 def mitsuba_frames(mesh: UVMesh, texels: Texels) -> np.ndarray:

@@ -78,25 +78,29 @@ def fuse(
 def _extent(cameras, depths, box):
     """(lower corner [3], upper corner [3], median size of a pixel) of all that is seen."""
     lower, upper, sizes = np.full(3, np.inf), np.full(3, -np.inf), []
-    for camera, depth in zip(cameras, depths):
-        point, z = _points(camera, depth, box)
-        if dr.width(z):
-            lower = np.minimum(lower, dr.ravel(dr.min(point, axis=1)).numpy())
-            upper = np.maximum(upper, dr.ravel(dr.max(point, axis=1)).numpy())
-            sizes.append(np.median(z.numpy()) / max(camera.focal))
+    for camera, point, z in _seen(cameras, depths, box):
+        lower = np.minimum(lower, dr.ravel(dr.min(point, axis=1)).numpy())
+        upper = np.maximum(upper, dr.ravel(dr.max(point, axis=1)).numpy())
+        sizes.append(np.median(z.numpy()) / max(camera.focal))
     return lower, upper, float(np.median(sizes)) if sizes else np.nan
 
 
-def _points(camera, depth, box):
-    """(positions, depths) of the pixels that see something in the ``box``."""
-    index = dr.compress(depth > 0)
+def _seen(cameras, depths, box):
+    """(camera, positions, depths) of the pixels of each camera that see something in the ``box``, where any do."""
+    for camera, depth in zip(cameras, depths):
+        index = dr.compress(depth > 0)
+        if dr.width(index) and box is not None:
+            index = dr.gather(mi.UInt32, index, dr.compress(box.contains(_points(camera, depth, index)[0])))
+        if dr.width(index):
+            yield camera, *_points(camera, depth, index)
+
+
+def _points(camera, depth, index):
+    """(positions, depths) of the pixels ``index``."""
     z = dr.gather(mi.Float, depth, index)
     point = opaque(camera).origin + z * pixel_rays(camera, index)
     dr.eval(point, z)
-    if box is None:
-        return point, z
-    inside = dr.compress(box.contains(point))
-    return dr.gather(mi.Point3f, point, inside), dr.gather(mi.Float, z, inside)
+    return point, z
 
 
 def _seen_blocks(cameras, depths, box, origin, voxel, shape):
@@ -104,8 +108,7 @@ def _seen_blocks(cameras, depths, box, origin, voxel, shape):
     seen = dr.zeros(mi.UInt32, int(shape.prod()))
     lower, size = mi.Point3f(*map(_opaque, origin)), _opaque(BLOCK * voxel)
     count = [dr.opaque(mi.UInt32, int(n)) for n in shape]
-    for camera, depth in zip(cameras, depths):
-        point, _ = _points(camera, depth, box)
+    for camera, point, _ in _seen(cameras, depths, box):
         away = dr.normalize(point - opaque(camera).origin)
         for step in np.linspace(-TRUNCATION, TRUNCATION, 5):
             at = mi.Vector3i(dr.floor((point + _opaque(step * voxel) * away - lower) / size))
