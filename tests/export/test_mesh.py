@@ -4,12 +4,10 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from PIL import Image
 from scipy.spatial import KDTree
 
 import rgs_mi
@@ -19,18 +17,22 @@ from rgs_mi.core.camera import Camera
 from rgs_mi.core.color import srgb_encode
 from rgs_mi.core.errors import UserError
 from rgs_mi.datasets.path_traced import train_directions
-from rgs_mi.export.mesh import stock_scene, tsdf
+from rgs_mi.export.mesh import gltf, stock_scene, tsdf
+from rgs_mi.export.mesh import refine as refine_module
+from rgs_mi.export.mesh.build import build
 from rgs_mi.export.mesh.depth_maps import depth_map
+from rgs_mi.export.mesh.refine import Photograph
 from rgs_mi.export.mesh.surface import UVMesh, largest_parts, simplified, smoothed
 from rgs_mi.export.mesh.textures import Texels, gltf_frames, mitsuba_frames, normal_map, vertex_tangents
 from rgs_mi.export.splats import fibonacci_sphere
+from rgs_mi.plugins import lit_surfels
 from rgs_mi.splat.reference import median_depth_reference
 from rgs_mi.splat.tiles import Cutoffs
 from rgs_mi.surfels.ply import write_ply
 from rgs_mi.surfels.surfels import rotation_from_normal
 from rgs_mi.targets.meshes import join, unit
 
-from judges import package, validated_gltf
+from judges import blender, package, validated_gltf
 from scenes import orbit_camera, sphere_surfels, tangent_surfels
 
 SIZE = 64
@@ -63,18 +65,18 @@ def test_median_depth_equals_reference():
 
 
 def integrated_slowly(cameras, depths, points):
-    """(16) by NumPy: (mean of s, number of views that tell of it) of each point."""
+    """(16) by NumPy: (mean of s, sum of w) of each point."""
     total, weight = np.zeros(len(points)), np.zeros(len(points))
     for camera, depth in zip(cameras, depths):
         pixels, z = camera.project(points)
         for k, ((x, y), z) in enumerate(zip(np.floor(pixels).astype(int), z)):
             if z > 0 and 0 <= x < camera.size[0] and 0 <= y < camera.size[1]:
                 d = depth[y, x]
-                s = 1 if d == 0 else min((d - z) / (tsdf.TRUNCATION * VOXEL), 1)
-                if s > -1:
-                    total[k] += s
-                    weight[k] += 1
-    return np.where(weight > 0, total / np.maximum(weight, 1), 1), weight
+                s = 1 if d == 0 else max(min((d - z) / (tsdf.TRUNCATION * VOXEL), 1), -1)
+                w = min(1 + s, 1)
+                total[k] += w * s
+                weight[k] += w
+    return np.where(weight > 0, total / np.where(weight > 0, weight, 1), 1), weight
 
 
 VOXEL = 0.05
@@ -94,7 +96,7 @@ def test_integration_equals_its_slow_twin(sphere):
     voxels = 8 * volume.blocks[some[:, 0]] + some[:, 1:]
     distance, weight = integrated_slowly(views, depths, volume.origin + volume.voxel * voxels)
     at = tuple(some.T)
-    same = volume.weight[at] == weight  # a voxel on the edge of a pixel may be on either side of it
+    same = abs(volume.weight[at] - weight) < 1e-3  # a voxel on the edge of a pixel may be on either side of it
     assert same.mean() > 0.99 and (weight > 0).mean() > 0.5 and (weight == 0).any()
     assert np.quantile(abs(volume.distance[at] - distance), 0.99) < 1e-3
 
@@ -104,7 +106,7 @@ def test_sphere(sphere, monkeypatch):
     monkeypatch.setattr(tsdf, "_SLAB", 3)  # layers of blocks, so that there are seams
     mesh = tsdf.surface(sphere[-1])
     error = abs(np.linalg.norm(mesh.vertices, axis=1) - 1)
-    assert error.mean() < 0.2 * VOXEL and error.max() < VOXEL
+    assert error.mean() < 0.3 * VOXEL and error.max() < VOXEL
     centers = mesh.vertices[mesh.faces].mean(1)
     area = np.cross(*(mesh.vertices[mesh.faces[:, k]] - mesh.vertices[mesh.faces[:, 0]] for k in (1, 2)))
     assert ((area * centers).sum(1) > 0).mean() > 0.999
@@ -142,7 +144,7 @@ def test_smoothing_keeps_to_the_normals(sphere):
     smooth = smoothed(rough, unit(mesh.vertices))
     spread = lambda m: np.linalg.norm(m.vertices, axis=1).std()
     assert spread(smooth) < 0.5 * spread(rough)
-    assert abs(np.linalg.norm(smooth.vertices, axis=1).mean() - 1) < 0.2 * VOXEL
+    assert abs(np.linalg.norm(smooth.vertices, axis=1).mean() - 1) < 0.3 * VOXEL
 
 
 def test_simplified(sphere):
@@ -272,3 +274,99 @@ def test_stock_mitsuba_shows_what_we_show(exported, tmp_path):
     shown = [srgb_encode(np.clip(image, 0, 1)) for image in (ours, theirs)]
     assert -10 * np.log10(np.mean((shown[0] - shown[1]) ** 2)) > 30
     assert abs(ours.mean() / theirs.mean() - 1) < 0.02
+
+
+def test_other_readers_take_the_glb(exported):
+    """Khronos's validator finds no error, and trimesh the mesh, in a world whose y points up."""
+    trimesh = pytest.importorskip("trimesh")
+    _, folder = exported
+    (mesh,) = trimesh.load(folder / gltf.NAME).geometry.values()
+    own = mi.traverse(mi.load_dict({"type": "ply", "filename": str(folder / stock_scene.MESH)}))
+    vertices = np.array(own["vertex_positions"]).reshape(-1, 3)
+    assert np.allclose(mesh.vertices, vertices @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]), atol=1e-5)
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi, rel=0.05)
+    color = np.asarray(mesh.visual.material.baseColorTexture)
+    shine = np.asarray(mesh.visual.material.metallicRoughnessTexture)
+    assert color.shape[:2] == shine.shape[:2] and abs(np.median(shine[..., 1]) / 255 - 0.3) < 0.02
+
+
+def test_khronos_validator(exported):
+    package("gltf-validator")
+    assert [m for m in validated_gltf(exported[1] / gltf.NAME) if m["severity"] < 2] == []
+
+
+def test_blender_shows_what_mitsuba_shows(exported, tmp_path):
+    """Cycles, under the same light: colours of what the object shows are within 5 %."""
+    run, folder = exported
+    scene = mi.load_file(str(folder / stock_scene.SCENE), parallel=False)
+    camera, rotation = Camera.from_sensor(scene.sensors()[5]), np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    theirs = blender(folder / gltf.NAME, folder / stock_scene.ENVIRONMENT, camera, rotation, tmp_path)
+    ours = np.array(mi.render(scene, sensor=5, spp=64))[..., :3]
+    inside = sphere_depth(camera) > 0
+    assert np.allclose(ours[inside].mean(0), theirs[inside].mean(0), rtol=0.05)
+    assert np.allclose(ours[~inside].mean(0), theirs[~inside].mean(0), rtol=0.05)
+    shown = [srgb_encode(np.clip(image, 0, 1)) for image in (ours, theirs)]
+    assert -10 * np.log10(np.mean((shown[0] - shown[1]) ** 2)) > 32
+
+
+# ---- Refined ----
+
+
+def photographs_of(folder):
+    """What the stock scene in ``folder`` shows to its sensors, with masks."""
+    scene = mi.load_file(str(folder / stock_scene.SCENE), parallel=False)
+    views = []
+    for k, sensor in enumerate(scene.sensors()):
+        camera = Camera.from_sensor(sensor)
+        image = np.array(mi.render(scene, sensor=k, spp=64))[..., :3]
+        mask = sphere_depth(camera) > 0
+        views.append(Photograph(camera, np.float32(np.concatenate([image, mask[..., None]], -1))))
+    return views
+
+
+def test_refining_finds_what_was_changed(exported, monkeypatch):
+    """Colours that were darkened come back, and all stays where it may be."""
+    run, folder = exported
+    lit = not (folder / "radiance.exr").exists()
+    name = "base_color" if lit else "radiance"
+    views = photographs_of(folder)
+    scene_mesh = build(
+        lit_surfels(mi.load_file(str(run / "scene.xml"), parallel=False), run)[0], [v.camera for v in views], run, lit=lit, eta=1.5, quiet=True
+    )
+    truth = getattr(scene_mesh.textures, name)
+    spoiled = replace(scene_mesh.textures, **{name: 0.7 * truth})
+    light = np.array(mi.Bitmap(str(run / "environment.exr")))
+    changed = folder.parent / "changed"
+    stock_scene.write(changed, scene_mesh.mesh, scene_mesh.texels, spoiled, 1.5, light, run / "scene.xml")
+    monkeypatch.setitem(refine_module._RATES, name, 0.03)
+    monkeypatch.setitem(refine_module._RATES, "environment", 0.0)
+    found = refine_module.refine(changed / stock_scene.SCENE, scene_mesh.mesh, scene_mesh.texels, views, [name], 8, quiet=True)
+    error = lambda image: abs(image - truth)[truth > 0.2].mean()
+    assert error(found[name]) < 0.5 * error(0.7 * truth)
+    assert found[name].min() >= 0 and (name == "radiance" or found[name].max() <= 1)
+    assert np.allclose(found["environment"], light, rtol=1e-3)
+
+
+# ---- Mistakes ----
+
+
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        ({"to": "splat", "refine": 1.0}, "--refine: only the format 'mesh'"),
+        ({"to": "usd", "data": "there"}, "--data: only the format 'mesh'"),
+        ({"to": "mesh", "refine": 0.0}, "--refine 0: needs a number of minutes above 0"),
+        ({"to": "mesh", "refine": 1.0}, "does not say where the photographs are: give their folder with --data"),
+        ({"to": "mesh", "data": "nowhere"}, "data folder 'nowhere' does not exist"),
+    ],
+)
+def test_mistakes(exported, options, words):
+    with pytest.raises(UserError, match=words) as error:
+        export(exported[0], quiet=True, **options)
+    assert "\n" not in str(error.value)
+
+
+def test_missing_package(exported, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xatlas", None)
+    with pytest.raises(UserError, match=r"packages are missing: pip install 'rgs-mi\[mesh\]'"):
+        export(exported[0], "mesh", quiet=True)

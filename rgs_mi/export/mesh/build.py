@@ -18,7 +18,7 @@ from .lookup import look_up
 from .surface import UVMesh, largest_parts, simplified, smoothed, unwrapped
 from .textures import Texels, Textures, textures
 
-_FACES, _MOST_FACES = 1 / 32, 40_000  # of the mesh, over those of the surface voxel by voxel; of any
+_FACES, _MOST_FACES = 1 / 16, 60_000  # of the mesh, over those of the surface voxel by voxel; of any
 _TEXEL = 0.7  # voxels
 _TOLERANCE = 2.0  # voxels between a camera's depth map and what it sees
 

@@ -1,11 +1,12 @@
 """Depth maps as one surface: a truncated signed distance, the mean over the views (Curless and Levoy 1996).
 
-A voxel at x, of depth z(x) to a camera whose map has the depth d where it sees x, is told
+A voxel at x, of depth z(x) to a camera whose map has the depth d where it sees x, is told s with the weight w,
 
-    s = min((d − z) / τ, 1) where s > −1, and 1 where the map has no depth: it looks past the surface there      (16)
+    s = max(min((d − z) / τ, 1), −1),   w = min(1 + s, 1)                                              (16)
 
-with the truncation τ of five voxels (2DGS); what is farther behind the surface it does not see. The surface is where the mean
-of s over the views is zero, between voxels that some view has told of.
+and s = w = 1 where the map has no depth: the camera looks past the surface there. The truncation τ is five voxels (2DGS). Behind
+the surface a camera is believed less and less, or else thin parts, seen from both sides, would come out too thick. The surface is
+where the mean of s is zero, between voxels that some view has told of.
 
 Voxels have about the size of a pixel on the surface. Only those within τ of what some view sees are there, in blocks of 8³:
 for the helmet at 400 × 400 pixels a tenth of its box, and at 800 × 800 half as many again of twice as fine a box. A hash of blocks, as
@@ -39,7 +40,7 @@ class Volume:
     voxel   distance between voxels, world units
     shape   [3] blocks of the whole box
     blocks  [B, 3] which of these are there
-    distance, weight  [B, 8, 8, 8] float32: the mean of s of (16), 1 where nothing is known; how many views told of it
+    distance, weight  [B, 8, 8, 8] float32: the mean of s of (16), 1 where nothing is known; the sum of w
     """
 
     origin: np.ndarray
@@ -126,16 +127,16 @@ def _integrated(cameras, depths, origin, voxel, blocks):
     point = mi.Point3f(*map(_opaque, origin)) + _opaque(voxel) * mi.Point3f(index)
     total, weight = dr.zeros(mi.Float, dr.width(lane)), dr.zeros(mi.Float, dr.width(lane))
     for camera, depth in zip(cameras, depths):
-        signed, known = _signed(camera, depth, point, _opaque(TRUNCATION * voxel))
-        total += dr.select(known, signed, 0)
-        weight += dr.select(known, 1, 0)
+        signed, told = _signed(camera, depth, point, _opaque(TRUNCATION * voxel))
+        total += told * signed
+        weight += told
         dr.eval(total, weight)
-    mean = dr.select(weight > 0, total / dr.maximum(weight, 1), 1)
+    mean = dr.select(weight > 0, total / dr.select(weight > 0, weight, 1), 1)
     return (values.numpy().reshape(-1, BLOCK, BLOCK, BLOCK) for values in (mean, weight))
 
 
 def _signed(camera, depth, point, truncation):
-    """(s of (16), whether the camera tells of it) of each ``point``."""
+    """s and w of (16) for each ``point``."""
     R, origin, focal, principal, lens = opaque(camera)
     p = R @ (point - origin)
     x, y = p.x / p.z, p.y / p.z
@@ -144,8 +145,8 @@ def _signed(camera, depth, point, truncation):
     column, row = mi.Int32(dr.floor(x * focal.x + principal.x)), mi.Int32(dr.floor(y * focal.y + principal.y))
     inside = (p.z > 0) & (column >= 0) & (column < camera.size[0]) & (row >= 0) & (row < camera.size[1])
     d = dr.gather(mi.Float, depth, mi.UInt32(row * camera.size[0] + column), inside)
-    signed = dr.select(d > 0, dr.minimum((d - p.z) / truncation, 1), 1)
-    return signed, inside & (signed > -1)
+    signed = dr.select(d > 0, dr.clip((d - p.z) / truncation, -1, 1), 1)
+    return signed, dr.select(inside, dr.minimum(1 + signed, 1), 0)
 
 
 def _opaque(value):
