@@ -46,7 +46,8 @@ def export(
     if kernel is not None and kernel not in usd_splat.KERNELS:
         raise UserError(f"--kernel {kernel}: unknown kernel: choose one of {', '.join(usd_splat.KERNELS)}")
     if to != "mesh" and (refine is not None or data is not None):
-        raise UserError(f"--{'data' if refine is None else 'refine'}: only the format 'mesh' takes it: leave it out, or say --to mesh")
+        given = "data" if refine is None else "refine"
+        raise UserError(f"--{given}: only the format 'mesh' takes it: leave it out, or say --to mesh")
     if refine is not None and not 0 < refine < math.inf:
         raise UserError(f"--refine {refine:g}: needs a number of minutes above 0")
     if to == "usd":

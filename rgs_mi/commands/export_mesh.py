@@ -30,12 +30,12 @@ def export_mesh(
     data: str | Path | None = None,
     quiet: bool = False,
 ) -> list[Path]:
-    """Write the surfels of the ``scene``, which is that of the file ``path`` in the folder ``run``, as a mesh into ``folder``: as a
-    GLB, turned by ``rotation`` [3, 3], and as a scene of stock Mitsuba; return the paths of all files.
+    """Write the surfels of the ``scene``, which is that of the file ``path`` in the folder ``run``, as a mesh into ``folder``:
+    as a GLB, turned by ``rotation`` [3, 3], and as a scene of stock Mitsuba; return the paths of all files.
 
-    The mesh is what the run's training cameras see; where the photographs are gone, what the scene's sensors see. With ``minutes``
-    textures and environment are refined that long against the training photographs, in the folder ``data`` (None: where metrics.json
-    says that they were).
+    The mesh is what the run's training cameras see; where the photographs are gone, what the scene's sensors see. With
+    ``minutes`` textures and environment are refined that long against the training photographs, in the folder ``data`` (None:
+    where metrics.json says that they were).
 
     Raises: UserError for a run without surfels or, with ``minutes``, without photographs or environment, and where a package is
     missing or a file can't be written.
@@ -66,14 +66,14 @@ def export_mesh(
 
 def _tell_what_is_lost(path, scene, lighting):
     """A line on stderr for what a mesh does not have."""
-    if lighting is None:
-        return
-    if lighting.turntable is not None:
-        print(f"{path}: the light goes round with the camera, which no other program does: it is that of azimuth 0", file=sys.stderr)
-    if scene.integrator().room is not None:
-        print(f"{path}: the light is painted on a room, which no other program knows: it is at infinity", file=sys.stderr)
-    if lighting.shader is not None:
-        print(f"{path}: what its shader makes of reflections is left out", file=sys.stderr)
+    lost = {
+        "the light goes round with the camera, which no other program does: it is that of azimuth 0": "turntable",
+        "the light is painted on a room, which no other program knows: it is at infinity": "room",
+        "what its shader makes of reflections is left out": "shader",
+    }
+    for words, name in lost.items():
+        if lighting is not None and getattr(scene.integrator(), name):
+            print(f"{path}: {words}", file=sys.stderr)
 
 
 def _photographs(run, data, needed) -> list[Photograph]:

@@ -25,7 +25,7 @@ def export(parser: Parser) -> Run:
         metavar="MINUTES",
         help="of mesh: so long Mitsuba's path tracer fits textures and light to the training photographs",
     )
-    parser.add_argument("--data", type=Path, metavar="DIR", help="of mesh: the photographs (default: where the run says they were)")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="of mesh: the photographs (default: where they were)")
     add_common(parser)
 
     def run(args):

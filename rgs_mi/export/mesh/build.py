@@ -11,7 +11,6 @@ from ...core.camera import Camera
 from ...core.errors import UserError
 from ...core.progress import Progress
 from ...surfels.surfels import Surfels
-from ...targets.meshes import Mesh
 from . import tsdf
 from .depth_maps import depth_map
 from .lookup import look_up

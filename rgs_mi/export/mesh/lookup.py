@@ -4,8 +4,8 @@ The G-buffer of each camera is looked up where it sees the point, and the means 
 
     w = (n·ω)² α                                                                                      (17)
 
-with the surface's normal n, the direction ω to the camera and the coverage α. A camera sees a point where its depth map is as deep
-as the point is in all four pixels about it, so that nothing is taken from the other side of an edge.
+with the surface's normal n, the direction ω to the camera and the coverage α. A camera sees a point where its depth map is as
+deep as the point is in all four pixels about it, so that nothing is taken from the other side of an edge.
 """
 
 from collections.abc import Callable, Sequence

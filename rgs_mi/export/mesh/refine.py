@@ -5,12 +5,12 @@
     Σ (s'(y) (x − y))²                                                                                  (20)
 
 over the pixels that the mesh fills, with the radiance x of a few samples, the photograph's linear value y and the slope s' of the
-sRGB curve there: the squared error of display values, to first order, whose gradient the samples' noise leaves without bias, since
-those of the derivative are others. Where the photograph is white a brighter x is no error.
+sRGB curve there: the squared error of display values, to first order, whose gradient the samples' noise leaves without bias,
+since those of the derivative are others. Where the photograph is white a brighter x is no error.
 
 What is learned is a correction at each vertex of the mesh, which is added to the textures in between, and a factor of the
-environment on a coarse grid. Detail is in both already; what path tracing changes is as smooth as light is, and a texel alone sees
-too few samples to tell an error from their noise.
+environment on a coarse grid. Detail is in both already; what path tracing changes is as smooth as light is, and a texel alone
+sees too few samples to tell an error from their noise.
 """
 
 import time

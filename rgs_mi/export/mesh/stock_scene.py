@@ -27,7 +27,13 @@ DEPTH = 6  # of paths
 
 
 def write(
-    folder: str | Path, mesh: UVMesh, texels: Texels, textures: Textures, eta: float, environment: np.ndarray | None, run: Path
+    folder: str | Path,
+    mesh: UVMesh,
+    texels: Texels,
+    textures: Textures,
+    eta: float,
+    environment: np.ndarray | None,
+    run: Path,
 ) -> list[Path]:
     """Write the module's files into ``folder`` and return their paths. ``environment`` are the texels [rows, columns, 3] of the
     light (None: it has none), and ``run`` is the scene file whose emitter and sensors are taken over.

@@ -1,4 +1,4 @@
-"""Textures of a mesh: what the surfels are like at each texel, as Mitsuba's principled BSDF and glTF's metallic-roughness take it.
+"""Textures of a mesh: what surfels are like at each texel, as Mitsuba's principled BSDF and glTF's metallic-roughness take it.
 
 Where surfels have a diffuse radiance of their own the mesh emits it, and must not reflect light diffusely as well. So its
 BSDF is that of a metal throughout, whose reflectance at normal incidence is what the surfels reflect there,
@@ -60,7 +60,8 @@ class Texels:
         params.update()
         k = dr.arange(mi.UInt32, width * height)
         origin = mi.Point3f((mi.Float(k % width) + 0.5) / width, (mi.Float(k // width) + 0.5) / height, 1)
-        hit = mi.load_dict({"type": "scene", "charts": flat}).ray_intersect_preliminary(mi.Ray3f(origin, mi.Vector3f(0, 0, -1)))
+        plane = mi.load_dict({"type": "scene", "charts": flat})
+        hit = plane.ray_intersect_preliminary(mi.Ray3f(origin, mi.Vector3f(0, 0, -1)))
         index = np.flatnonzero(hit.is_valid().numpy())
         face, b = hit.prim_index.numpy()[index], hit.prim_uv.numpy().T[index].astype(float)
         barycentric = np.column_stack([1 - b.sum(1), b])
@@ -69,8 +70,8 @@ class Texels:
 
 
 def textures(mesh: UVMesh, texels: Texels, seen: Seen, lit: bool, eta: float) -> Textures:
-    """Return the `Textures` of a ``mesh`` from what was ``seen`` at its ``texels``; ``lit`` says whether surfels have no radiance of
-    their own, and ``eta`` is their index of refraction. What no camera sees is like the nearest that one does."""
+    """Return the `Textures` of a ``mesh`` from what was ``seen`` at its ``texels``; ``lit`` says whether surfels have no radiance
+    of their own, and ``eta`` is their index of refraction. What no camera sees is like the nearest that one does."""
     near = nearest(mesh, texels, seen.known if seen.known.any() else None)
     filled = lambda values: values[near].reshape(*mesh.size[::-1], -1).astype(np.float32)
     base_color, metallic = np.clip(seen.base_color, 0, 1), np.clip(seen.metallic, 0, 1)
@@ -99,9 +100,9 @@ def nearest(mesh: UVMesh, texels: Texels, among: np.ndarray | None = None) -> np
 # ---- Tangent space ----
 
 
-def normal_map(mesh: UVMesh, texels: Texels, normal: np.ndarray, frames: "Callable[[UVMesh, Texels], np.ndarray]") -> np.ndarray:
-    """Return the ``normal`` [H, W, 3] of a texture, world space, in the ``frames`` of its texels, in [0, 1] as images have it:
-    n / 2 + ½."""
+def normal_map(mesh: UVMesh, texels: Texels, normal: np.ndarray, frames: Callable[..., np.ndarray]) -> np.ndarray:
+    """Return the ``normal`` [H, W, 3] of a texture, world space, in the ``frames`` of its texels (`mitsuba_frames` or
+    `gltf_frames`), in [0, 1] as images have it: n / 2 + ½."""
     local = unit(np.einsum("tij,tj->ti", frames(mesh, texels), normal.reshape(-1, 3)[texels.index]))
     return (local[nearest(mesh, texels)].reshape(*mesh.size[::-1], 3) / 2 + 0.5).astype(np.float32)
 
@@ -126,7 +127,8 @@ def vertex_tangents(mesh: UVMesh) -> np.ndarray:
     """Return the tangents [V, 4] of a ``mesh`` as glTF has them: unit vectors along u, perpendicular to the normals, and the sign
     w of the bitangent w n × t, which points upwards on the picture, against v."""
     du, dv = mesh.tangents().transpose(1, 0, 2)
-    total = lambda values: np.stack([np.bincount(mesh.faces.ravel(), np.repeat(v, 3), len(mesh.vertices)) for v in values.T], 1)
+    corners, count = mesh.faces.ravel(), len(mesh.vertices)
+    total = lambda values: np.stack([np.bincount(corners, np.repeat(v, 3), count) for v in values.T], 1)
     n, along, down = mesh.normals.astype(float), total(unit(du)), total(unit(dv))
     t = along - n * (n * along).sum(1, keepdims=True)
     lost = np.linalg.norm(t, axis=1) < 1e-6

@@ -8,9 +8,10 @@ and s = w = 1 where the map has no depth: the camera looks past the surface ther
 the surface a camera is believed less and less, or else thin parts, seen from both sides, would come out too thick. The surface is
 where the mean of s is zero, between voxels that some view has told of.
 
-Voxels have about the size of a pixel on the surface. Only those within τ of what some view sees are there, in blocks of 8³:
-for the helmet at 400 × 400 pixels a tenth of its box, and at 800 × 800 half as many again of twice as fine a box. A hash of blocks, as
-others have it, is not worth its code, since the mask of the blocks of a whole box is small.
+Voxels have about the size of a pixel on the surface. Only those near what some view sees are there, in blocks of 8³: of the
+helmet at 400 × 400 pixels these are 13 000 blocks, 6.7 million voxels of a box of 43 million. Which blocks there are, a mask of
+the whole box says, one in 512 of its voxels, so that no hash of blocks is needed; marching cubes fill some layers of blocks at a
+time. Four times as many pixels have four times as many voxels, and fit as well.
 """
 
 from collections.abc import Sequence
