@@ -1,7 +1,7 @@
 """A textured mesh as a scene that Mitsuba renders as it comes: nothing of this package is needed.
 
-    scene.xml            integrator path, the mesh under a normalmap of a principled BSDF, an area emitter where surfels have a
-                         radiance of their own, the environment, and the sensors of the run
+    scene.xml            integrator path, the mesh under a twosided normalmap of a principled BSDF, an area emitter where
+                         surfels have a radiance of their own, the environment, and the sensors of the run
     mesh.ply             vertices, normals and texture coordinates, in the run's own world
     base_color.exr, roughness.exr, metallic.exr, normal.exr, radiance.exr    its textures, half floats, linear
     environment.exr      latitude-longitude
@@ -89,7 +89,8 @@ def _scene(images, eta, run, lit):
     ET.SubElement(_named(root, "integrator", "path"), "integer", name="max_depth", value=str(DEPTH))
     shape = _named(root, "shape", "ply", id="mesh")
     ET.SubElement(shape, "string", name="filename", value=MESH)
-    normals = _named(shape, "bsdf", "normalmap")
+    both = _named(shape, "bsdf", "twosided")  # at the outline, interpolated normals may be turned away: it would be black
+    normals = _named(both, "bsdf", "normalmap")
     ET.SubElement(normals, "boolean", name="use_shadowing_function", value="false")  # surfels know no such term
     _texture(normals, "normalmap", "normal")
     material = _named(normals, "bsdf", "principled", id="material")
