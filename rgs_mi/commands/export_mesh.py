@@ -43,15 +43,16 @@ def export_mesh(
     surfels, lighting = lit_surfels(scene, path)
     if not len(surfels):
         raise UserError(f"{path}: its shape of surfels is empty: there is nothing to export")
-    if minutes and (lighting is None or lighting.turntable is not None):
-        raise UserError(f"{path}: has no light that stands still, which --refine needs: leave it out")
+    emitter = scene.environment()
+    mapped = emitter is not None and emitter.class_name() == "EnvironmentMapEmitter"
+    if minutes and (not mapped or lighting is None or lighting.turntable is not None):
+        raise UserError(f"{path}: has no environment map that stands still, which --refine needs: leave it out")
     _tell_what_is_lost(path, scene, lighting)
     photographs = _photographs(run, data, needed=bool(minutes))
     seen = [p.camera for p in photographs] or [Camera.from_sensor(sensor) for sensor in scene.sensors()]
     lit, eta = lighting is not None and lighting.lit, surfels_of(scene, path).eta
     result = build(surfels, seen, path, lit=lit, eta=eta, box=lighting and lighting.box, quiet=quiet)
-    emitter = scene.environment()
-    environment = None if emitter is None else Environment.from_emitter(emitter).texels.numpy()
+    environment = Environment.from_emitter(emitter).texels.numpy() if mapped else None
     write = lambda: stock_scene.write(folder, result.mesh, result.texels, result.textures, eta, environment, path)
     paths = write()
     if minutes:

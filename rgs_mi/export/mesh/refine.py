@@ -28,6 +28,7 @@ from ...core.camera import Camera, opaque, pixel_directions
 from ...core.color import srgb_decode
 from ...core.interrupt import GracefulInterrupt
 from ...core.progress import Progress
+from .stock_scene import LIGHT
 from .surface import UVMesh
 from .textures import Texels, nearest
 
@@ -121,10 +122,10 @@ class _Texture:
 class _Light:
     """An environment that is what it was times factors on a coarse grid."""
 
-    name = "environment"
+    name = LIGHT
 
     def __init__(self, params):
-        self.key = next(key for key in params.keys() if key.endswith("environment.data"))
+        self.key = f"{LIGHT}.data"
         self.before = as_tensor(params[self.key].numpy())
 
     def start(self):

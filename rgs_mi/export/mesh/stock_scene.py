@@ -23,6 +23,7 @@ from .surface import UVMesh
 from .textures import Texels, Textures, mitsuba_frames, normal_map
 
 SCENE, MESH, ENVIRONMENT = "scene.xml", "mesh.ply", "environment.exr"
+LIGHT = "environment"  # the emitter's id
 DEPTH = 6  # of paths
 
 
@@ -103,7 +104,9 @@ def _scene(images, eta, run, lit):
         _texture(emitter, "radiance", "radiance")
     emitter = run.find("emitter[@type='envmap']")
     if emitter is not None and lit:
-        root.append(copy.deepcopy(emitter))
+        light = _named(root, "emitter", "envmap", id=LIGHT)
+        ET.SubElement(light, "string", name="filename", value=ENVIRONMENT)
+        light.extend(copy.deepcopy(turn) for turn in emitter.findall("transform"))  # its scale is in the texels
     root.extend(copy.deepcopy(sensor) for sensor in run.findall("sensor"))
     return root
 
