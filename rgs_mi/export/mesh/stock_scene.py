@@ -6,8 +6,8 @@
     base_color.exr, roughness.exr, metallic.exr, normal.exr, radiance.exr    its textures, half floats, linear
     environment.exr      latitude-longitude
 
-The emitter has the sampling weight 0: rays find it, but none is sent to look for it. It is seen wherever the object is, so that
-the integrator must show emitters, and with them the environment behind the object.
+Where there is an environment the emitter has the sampling weight 0: rays find it, but none is sent to look for it. It is seen
+wherever the object is, so that the integrator must show emitters, and with them the environment behind the object.
 """
 
 import copy
@@ -100,7 +100,8 @@ def _scene(images, eta, run, lit):
         _texture(material, name, name)
     if "radiance" in images:
         emitter = _named(shape, "emitter", "area")
-        ET.SubElement(emitter, "float", name="sampling_weight", value="0")
+        if lit:  # Mitsuba wants one emitter that it can sample
+            ET.SubElement(emitter, "float", name="sampling_weight", value="0")
         _texture(emitter, "radiance", "radiance")
     emitter = run.find("emitter[@type='envmap']")
     if emitter is not None and lit:
