@@ -1,20 +1,23 @@
-"""Programs of others that judge exports: packages of npm, in ``tests/npm``, and OpenUSD. Tests are skipped without them;
-CONTRIBUTING.md says how to install them."""
+"""Programs of others that judge exports: packages of npm, in ``tests/npm``, OpenUSD, and Blender. Tests are skipped without
+them; CONTRIBUTING.md says how to install them."""
 
 import base64
 import io
 import json
+import os
 import shutil
 import subprocess
 from contextlib import contextmanager
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
 
 from browser import open_tab
 
+BLENDER = "RGS_MI_BLENDER"  # names a Python that has Blender's module
 FOLDER = Path(__file__).parent / "npm"
 _SITE = "http://viewer.test/"
 _SECONDS = 100
@@ -49,6 +52,23 @@ def validated_gltf(path: Path) -> list[dict]:
 def splat_transform(*arguments) -> str:
     """What PlayCanvas's splat-transform prints."""
     return run_node(package("@playcanvas/splat-transform") / "bin" / "cli.mjs", "-w", *arguments, new=True)
+
+
+def blender(glb: Path, light: Path, camera, rotation, folder: Path, samples: int = 64) -> np.ndarray:
+    """What Blender's Cycles shows to a `Camera` of a GLB under the environment map ``light``, linear, [H, W, 3]; ``rotation``
+    [3, 3] takes the camera's world to the glTF's. Files between are in ``folder``."""
+    if not os.environ.get(BLENDER):
+        pytest.skip(f"needs Blender: pip install bpy==5.0.1 in an environment of Python 3.11, whose python {BLENDER} names")
+    to_world = camera.to_world.copy()
+    to_world[:3] = rotation @ to_world[:3]
+    view = {"to_world": to_world.tolist(), "size": list(camera.size)}
+    view["fov_x"] = 2 * float(np.arctan(0.5 * camera.size[0] / camera.focal[0]))
+    (folder / "camera.json").write_text(json.dumps(view))
+    out = folder / "blender.exr"
+    arguments = [FOLDER.parent / "blender_render.py", glb, light, folder / "camera.json", out, samples]
+    done = subprocess.run([os.environ[BLENDER], *map(str, arguments)], capture_output=True, text=True, timeout=_SECONDS)
+    assert done.returncode == 0, done.stderr
+    return np.array(mi.Bitmap(str(out)))[..., :3]
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """A finished run as files that others open. What `rgs-mi export` calls."""
 
 import difflib
+import math
 from pathlib import Path
 
 import mitsuba as mi
@@ -11,19 +12,29 @@ from ..core.files import make_folder
 from ..core.scene_files import load_scene
 from ..export import gltf_splat, splat_ply, usd_splat
 from ..export.bake import bake
+from ..export.mesh.surface import PACKAGES, packages
 from ..export.mitsuba_scene import SCENE
 from ..report.results import finished
 from ..shading.environment import Environment
+from .export_mesh import export_mesh
 
-FORMATS = ("splat", "gltf-splat", "usd")
+FORMATS = ("splat", "gltf-splat", "usd", "mesh")
 _RIGID = 1e-4  # how far an environment's ``to_world`` may be from a rotation
 
 
 def export(
-    run: str | Path, to: str, *, out: str | Path | None = None, kernel: str | None = None, quiet: bool = False
+    run: str | Path,
+    to: str,
+    *,
+    out: str | Path | None = None,
+    kernel: str | None = None,
+    refine: float | None = None,
+    data: str | Path | None = None,
+    quiet: bool = False,
 ) -> list[Path]:
     """Write the finished fit in the folder ``run`` in the format ``to``, one of `FORMATS`, into the folder ``out`` (None:
-    ``export/FORMAT`` in ``run``), and return the paths of its files. ``kernel`` is that of `usd_splat.write` (None: its default).
+    ``export/FORMAT`` in ``run``), and return the paths of its files. ``kernel`` is that of `usd_splat.write` (None: its default),
+    ``refine`` (minutes; None: not at all) and ``data`` are those of `export_mesh`.
 
     Raises: UserError for an unknown format, a folder that holds no finished run, a run without surfels, and where a package
     is missing or a file can't be written.
@@ -34,13 +45,22 @@ def export(
         raise UserError(f"--kernel {kernel}: only the format 'usd' has kernels: leave it out, or say --to usd")
     if kernel is not None and kernel not in usd_splat.KERNELS:
         raise UserError(f"--kernel {kernel}: unknown kernel: choose one of {', '.join(usd_splat.KERNELS)}")
+    if to != "mesh" and (refine is not None or data is not None):
+        given = "data" if refine is None else "refine"
+        raise UserError(f"--{given}: only the format 'mesh' takes it: leave it out, or say --to mesh")
+    if refine is not None and not 0 < refine < math.inf:
+        raise UserError(f"--refine {refine:g}: needs a number of minutes above 0")
     if to == "usd":
         usd_splat.check()
+    if to == "mesh":
+        packages(*PACKAGES)
     run = Path(run)
     path = _scene_of(run)
     folder = run / "export" / to if out is None else Path(out)
     make_folder(folder)
     scene = load_scene(path, {})
+    if to == "mesh":
+        return export_mesh(run, path, scene, to_y_up(scene, path), folder, refine, data, quiet)
     splats = bake(scene, path, quiet)
     if to == "splat":
         return splat_ply.write(folder, splats)

@@ -67,22 +67,40 @@ def read(folder: Path, views: Sequence[View]) -> Registration | None:
 
     Raises: UserError where cameras.json is damaged, or says nothing of a view.
     """
+    saved = _read(folder, "evaluated", views)
+    if saved is None:
+        return None
+    poses, exposure, rows = saved
+    starts = {name: given for name, (given, _) in rows.items()}
+    return Registration(poses, exposure, starts, {name: found for name, (_, found) in rows.items()})
+
+
+def read_training(folder: Path, views: Sequence[View]) -> dict[str, Registered] | None:
+    """Return how the run in ``folder`` sees its training ``views``, by their names; None where it learned nothing of cameras.
+
+    Raises: UserError as `read` does.
+    """
+    saved = _read(folder, "train", views)
+    return None if saved is None else {name: found for name, (_, found) in saved[-1].items()}
+
+
+def _read(folder, kind, views):
+    """(whether poses were learned, exposures, {name: (camera as given, as found)}) of ``views``, 'train' or 'evaluated' ones."""
     path = folder / FILE
     if not path.is_file():
         return None
     try:
         saved = json.loads(read_file(path, JSON))
         poses, exposure = (bool(saved["learned"][name]) for name in ("poses", "exposure"))
-        starts, found = {}, {}
+        rows = {}
         for view in views:
-            row = saved["evaluated"][view.name]
+            row = saved[kind][view.name]
             lens = Lens(**{name: float(value) for name, value in row["distortion"].items()})
             (fx, fy), (cx, cy), (width, height) = row["focal"], row["principal"], row["size"]
             of = lambda key: Camera(np.array(row[key], float).reshape(4, 4), (fx, fy), (cx, cy), (width, height), lens)
-            starts[view.name] = of("given")
             gain = np.array(row["gain"], float).reshape(3) if exposure else None
-            found[view.name] = Registered(of("to_world"), gain)
-        return Registration(poses, exposure, starts, found)
+            rows[view.name] = of("given"), Registered(of("to_world"), gain)
+        return poses, exposure, rows
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise UserError(f"{path}: damaged, or not of these photographs ({error}): fit again") from error
 

@@ -64,6 +64,19 @@ def _front_to_back(surfels, camera) -> np.ndarray:
 
 def render_gbuffer_reference(surfels: "Surfels", camera: Camera, cutoffs: Cutoffs = Cutoffs()) -> Maps:
     """Return all maps of `render_gbuffer`, in the same frames and units."""
+    return _maps(surfels, camera, cutoffs)[0]
+
+
+def median_depth_reference(surfels: "Surfels", camera: Camera, cutoffs: Cutoffs = Cutoffs()) -> np.ndarray:
+    """Return the depths [W · H] of `composite.median_depth`."""
+    _, alpha, z = _maps(surfels, camera, cutoffs)
+    left = np.cumprod(1 - alpha.astype(np.float64), axis=1)
+    first = (left <= 0.5).argmax(1)[:, None]
+    return np.where(left[:, -1] <= 0.5, np.take_along_axis(z, first, 1)[:, 0], 0)
+
+
+def _maps(surfels, camera, cutoffs):
+    """(`Maps`; α and depth of every surfel in every pixel, front to back, [pixels, N] each)."""
     width, height = camera.size
     rotation, origin, focal, principal, lens = opaque(camera)
 
@@ -106,7 +119,7 @@ def render_gbuffer_reference(surfels: "Surfels", camera: Camera, cutoffs: Cutoff
     z = dr.select(on_plane <= on_screen, t, z)
     columns = lambda kind, value: [value] if kind is mi.Float else value
     accumulate = lambda kind, value: kind(*[dr.block_sum(weight * c, n) for c in columns(kind, value)])
-    return Maps(
+    maps = Maps(
         diffuse=accumulate(mi.Color3f, radiance),
         normal=accumulate(mi.Vector3f, dr.select(facing > 0, -normal, normal) + delta),
         base_color=accumulate(mi.Color3f, of(mi.Color3f, "base_color")),
@@ -117,3 +130,4 @@ def render_gbuffer_reference(surfels: "Surfels", camera: Camera, cutoffs: Cutoff
         alpha=accumulate(mi.Float, mi.Float(1)),
         square=accumulate(mi.Float, z * z),
     )
+    return maps, *(dr.detach(values).numpy().reshape(width * height, n) for values in (alpha, z))

@@ -1,0 +1,97 @@
+"""A finished run as a textured mesh: a GLB, and a scene of stock Mitsuba. What `rgs-mi export --to mesh` calls."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from ..core.camera import Camera
+from ..core.errors import UserError
+from ..datasets import load_dataset
+from ..datasets.resolution import LONGEST
+from ..export.mesh import gltf, stock_scene
+from ..export.mesh.build import build
+from ..export.mesh.refine import Photograph, refine
+from ..plugins import lit_surfels, surfels_of
+from ..report import cameras, results
+from ..shading.environment import Environment
+
+
+def export_mesh(
+    run: Path,
+    path: Path,
+    scene: "mi.Scene",
+    rotation: np.ndarray,
+    folder: Path,
+    minutes: float | None = None,
+    data: str | Path | None = None,
+    quiet: bool = False,
+) -> list[Path]:
+    """Write the surfels of the ``scene``, which is that of the file ``path`` in the folder ``run``, as a mesh into ``folder``:
+    as a GLB, turned by ``rotation`` [3, 3], and as a scene of stock Mitsuba; return the paths of all files.
+
+    The mesh is what the run's training cameras see; where the photographs are gone, what the scene's sensors see. With
+    ``minutes`` textures and environment are refined that long against the training photographs, in the folder ``data`` (None:
+    where metrics.json says that they were).
+
+    Raises: UserError for a run without surfels or, with ``minutes``, without photographs or environment, and where a package is
+    missing or a file can't be written.
+    """
+    surfels, lighting = lit_surfels(scene, path)
+    if not len(surfels):
+        raise UserError(f"{path}: its shape of surfels is empty: there is nothing to export")
+    emitter = scene.environment()
+    mapped = emitter is not None and emitter.class_name() == "EnvironmentMapEmitter"
+    if minutes and (not mapped or lighting is None or lighting.turntable is not None):
+        raise UserError(f"{path}: has no environment map that stands still, which --refine needs: leave it out")
+    _tell_what_is_lost(path, scene, lighting)
+    photographs = _photographs(run, data, needed=bool(minutes))
+    seen = [p.camera for p in photographs] or [Camera.from_sensor(sensor) for sensor in scene.sensors()]
+    lit, eta = lighting is not None and lighting.lit, surfels_of(scene, path).eta
+    result = build(surfels, seen, path, lit=lit, eta=eta, box=lighting and lighting.box, quiet=quiet)
+    environment = Environment.from_emitter(emitter).texels.numpy() if mapped else None
+    write = lambda: stock_scene.write(folder, result.mesh, result.texels, result.textures, eta, environment, path)
+    paths = write()
+    if minutes:
+        names = ("base_color", "roughness", *(("metallic",) if lit else ("radiance",)))  # unlit ones are metals throughout
+        scene_file = folder / stock_scene.SCENE
+        found = refine(scene_file, result.mesh, result.texels, photographs, names, 60 * minutes, quiet)
+        environment = found.pop("environment")
+        result = replace(result, textures=replace(result.textures, **found))
+        write()
+    return [*gltf.write(folder, result.mesh, result.texels, result.textures, rotation), *paths]
+
+
+def _tell_what_is_lost(path, scene, lighting):
+    """A line on stderr for what a mesh does not have."""
+    lost = {
+        "the light goes round with the camera, which no other program does: it is that of azimuth 0": "turntable",
+        "the light is painted on a room, which no other program knows: it is at infinity": "room",
+        "what its shader makes of reflections is left out": "shader",
+    }
+    for words, name in lost.items():
+        if lighting is not None and getattr(scene.integrator(), name):
+            print(f"{path}: {words}", file=sys.stderr)
+
+
+def _photographs(run, data, needed) -> list[Photograph]:
+    """The training photographs of a ``run`` with their cameras, as learned where they were; none where they are gone and not
+    ``needed``. Raises: UserError where they are needed, or were asked for."""
+    try:
+        saved = json.loads((run / results.METRICS).read_text())
+        folder = data or saved.get("photographs")
+        if not isinstance(folder, str | Path):
+            raise UserError(f"{run / results.METRICS} does not say where the photographs are: give their folder with --data")
+        views = load_dataset(folder, int(saved.get("settings", {}).get("resolution", LONGEST))).train
+    except UserError:
+        if needed or data is not None:
+            raise
+        print(f"{run}: its photographs are gone: the mesh is what the scene's sensors see", file=sys.stderr)
+        return []
+    learned = cameras.read_training(run, views)
+    if learned is None:
+        return [Photograph(view.camera, view.pixels) for view in views]
+    return [Photograph(learned[view.name].camera, view.pixels, learned[view.name].gain) for view in views]

@@ -1,0 +1,78 @@
+"""Surfels as a textured mesh, from depth maps to textures."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ...core.bounding_box import BoundingBox
+from ...core.camera import Camera
+from ...core.errors import UserError
+from ...core.progress import Progress
+from ...surfels.surfels import Surfels
+from . import tsdf
+from .depth_maps import depth_map
+from .lookup import look_up
+from .surface import UVMesh, largest_parts, simplified, smoothed, unwrapped
+from .textures import Texels, Textures, textures
+
+_FACES, _MOST_FACES = 1 / 16, 60_000  # of the mesh, over those of the surface voxel by voxel; of any
+_TEXEL = 0.7  # voxels
+_TOLERANCE = 2.0  # voxels between a camera's depth map and what it sees
+
+
+@dataclass(frozen=True)
+class TexturedMesh:
+    """A mesh and its textures, which are known at its ``texels``."""
+
+    mesh: UVMesh
+    texels: Texels
+    textures: Textures
+
+
+def build(
+    surfels: Surfels,
+    cameras: Sequence[Camera],
+    path: str | Path,
+    *,
+    lit: bool,
+    eta: float,
+    box: BoundingBox | None = None,
+    quiet: bool = False,
+) -> TexturedMesh:
+    """Return the ``surfels`` of the scene file ``path`` as a mesh, made of what ``cameras`` see of them in the ``box`` (None:
+    anywhere). ``lit`` and ``eta`` are those of `textures`.
+
+    Raises: UserError where cameras see nothing, or a package is missing.
+    """
+    with Progress(None, quiet, "meshing") as progress:
+        depths = []
+        for k, camera in enumerate(cameras):
+            depths.append(depth_map(surfels, camera))
+            progress.update(0.2 * (k + 1) / len(cameras))
+        volume = tsdf.fuse(cameras, depths, box)
+        progress.update(0.3)
+        dense = volume and tsdf.surface(volume)
+        if dense is None or not len(dense.faces):
+            raise UserError(f"{path}: its cameras see no surface of its surfels: there is nothing to export")
+        dense = largest_parts(dense)
+        tolerance = _TOLERANCE * volume.voxel
+        look = lambda points, normals, first, last: look_up(
+            surfels, cameras, depths, points, normals, tolerance, lambda f: progress.update(first + (last - first) * f)
+        )
+        dense = smoothed(dense, _normals(dense, look, 0.4, 0.6))
+        mesh = simplified(dense, min(_MOST_FACES, int(_FACES * len(dense.faces))))
+        progress.update(0.65)
+        mesh = replace(mesh, normals=_normals(mesh, look, 0.65, 0.7))
+        uv = unwrapped(mesh, _TEXEL * volume.voxel)
+        progress.update(0.8)
+        texels = Texels.of(uv)
+        seen = look(texels.points, texels.normals, 0.8, 1.0)
+    return TexturedMesh(uv, texels, textures(uv, texels, seen, lit, eta))
+
+
+def _normals(mesh, look, first, last):
+    """[V, 3] normals of the surfels at the vertices of a ``mesh``; its own where no camera sees them."""
+    seen = look(mesh.vertices, mesh.normals, first, last)
+    return np.where(seen.known[:, None], seen.normal, mesh.normals).astype(np.float32)

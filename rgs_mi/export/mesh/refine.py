@@ -1,0 +1,202 @@
+"""Textures and environment finished by Mitsuba's differentiable path tracer, against photographs.
+
+`prb` renders the stock scene as it will be looked at, with several bounces, and Adam follows the gradient of
+
+    Σ (s'(y) (x − y))²                                                                                  (20)
+
+over the pixels that the mesh fills, with the radiance x of a few samples, the photograph's linear value y and the slope s' of the
+sRGB curve there: the squared error of display values, to first order, whose gradient the samples' noise leaves without bias,
+since those of the derivative are others. Where the photograph is white a brighter x is no error.
+
+What is learned is a correction at each vertex of the mesh, which is added to the textures in between, and a factor of the
+environment on a coarse grid. Detail is in both already; what path tracing changes is as smooth as light is, and a texel alone
+sees too few samples to tell an error from their noise.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from skimage.transform import downscale_local_mean
+
+from ...core.arrays import as_float, as_tensor
+from ...core.camera import Camera, opaque, pixel_directions
+from ...core.color import srgb_decode
+from ...core.interrupt import GracefulInterrupt
+from ...core.progress import Progress
+from .stock_scene import LIGHT
+from .surface import UVMesh
+from .textures import Texels, nearest
+
+_DEPTH, _SPP, _SPP_GRADIENT = 4, 4, 2
+_LONGEST = 256  # pixels along a photograph's longer side, at most
+_RATES = {"base_color": 0.005, "roughness": 0.005, "metallic": 0.005, "radiance": 0.005, "environment": 0.02}
+_LAST = 0.1  # learning rates at the end, over those at the start
+_LIGHTS = (16, 32)  # rows and columns of the environment's factors
+_DARK, _SATURATED = 0.02, 0.98  # linear values up to which the slope is that; from which photographs are white
+_FARTHEST = 0.3  # display values: residuals beyond are those of fireflies
+_GRID = 4  # rays along a pixel's side that say whether the mesh fills it
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """What one camera took: ``pixels`` [H, W, 4], those of a `View`, with a ``gain`` [3] (None: 1)."""
+
+    camera: Camera
+    pixels: np.ndarray
+    gain: np.ndarray | None = None
+
+
+def refine(
+    path: str | Path,
+    mesh: UVMesh,
+    texels: Texels,
+    photographs: Sequence[Photograph],
+    names: Sequence[str],
+    seconds: float,
+    quiet: bool = False,
+) -> dict[str, np.ndarray]:
+    """Fit the textures ``names`` and the environment of the stock scene in the file ``path``, which shows the ``mesh`` with
+    ``texels``, to ``photographs`` for some ``seconds``, or until it is interrupted; return them, [H, W, channels] each."""
+    scene = mi.load_file(str(path), parallel=False)
+    params = mi.traverse(scene)
+    learned = [_Texture(name, params, mesh, texels) for name in names] + [_Light(params)]
+    params.keep([part.key for part in learned])
+    integrator = mi.load_dict({"type": "prb", "max_depth": _DEPTH})
+    optimizer = mi.ad.Adam(lr=1.0)
+    for part in learned:
+        optimizer[part.name] = part.start()
+    targets = [_target(scene, photograph) for photograph in photographs]
+    rng, begin, step, errors = np.random.default_rng(0), time.monotonic(), 0, []
+    with Progress(seconds, quiet, "refining") as progress, GracefulInterrupt() as interrupt:
+        while (spent := time.monotonic() - begin) < seconds and not interrupt.requested:
+            if step % len(targets) == 0:
+                order = rng.permutation(len(targets))
+            optimizer.set_learning_rate({p.name: _RATES[p.name] * _LAST ** (spent / seconds) for p in learned})
+            _assign(params, learned, optimizer)
+            errors.append(_step(scene, params, integrator, targets[order[step % len(targets)]], step))
+            optimizer.step()
+            step += 1
+            mean = float(np.mean(errors[-len(targets) :]))
+            progress.update(min(spent / seconds, 1), psnr=-10 * np.log10(max(mean, 1e-10)), steps=step)
+        progress.update(1)
+    _assign(params, learned, optimizer)
+    return {part.name: part.image(params[part.key].numpy()) for part in learned}
+
+
+class _Texture:
+    """A texture that is what it was plus what vertices are corrected by."""
+
+    def __init__(self, name, params, mesh, texels):
+        self.name, self.key = name, next(key for key in params.keys() if key.endswith(f"{name}.data"))
+        self.before = as_tensor(params[self.key].numpy())  # a copy: what is assigned is written into the scene's own
+        self.vertices = len(mesh.vertices)
+        near = nearest(mesh, texels)
+        self.corners = mi.Vector3u(np.ascontiguousarray(mesh.faces[texels.face[near]].T))
+        self.weights = mi.Vector3f(*(as_float(texels.barycentric[near, k]) for k in range(3)))
+
+    def start(self):
+        return dr.zeros(mi.TensorXf, (self.vertices, self.before.shape[2]))
+
+    def value(self, correction):
+        channels = self.before.shape[2]
+        sums = []
+        for c in range(channels):
+            at = lambda corner: dr.gather(mi.Float, correction.array, channels * corner + c, mode=dr.ReduceMode.Local)
+            sums.append(sum(w * at(corner) for w, corner in zip(self.weights, self.corners)))
+        texel = dr.arange(mi.UInt32, dr.width(sums)) * channels
+        added = dr.zeros(mi.Float, dr.width(sums) * channels)
+        for c, values in enumerate(sums):
+            dr.scatter(added, values, texel + c)
+        value = dr.maximum(self.before + mi.TensorXf(added, self.before.shape), 0)
+        return value if self.name == "radiance" else dr.minimum(value, 1)
+
+    def image(self, data):
+        return data
+
+
+class _Light:
+    """An environment that is what it was times factors on a coarse grid."""
+
+    name = LIGHT
+
+    def __init__(self, params):
+        self.key = f"{LIGHT}.data"
+        self.before = as_tensor(params[self.key].numpy())
+
+    def start(self):
+        return dr.zeros(mi.TensorXf, (*_LIGHTS, 3))
+
+    def value(self, logarithm):
+        rows, columns = self.before.shape[:2]
+        k = dr.arange(mi.UInt32, rows * columns)
+        x = (mi.Float(k % columns) - 0.5) / (columns - 2)  # a column on either side repeats
+        y = (mi.Float(k // columns) + 0.5) / rows
+        grid = mi.Texture2f(logarithm, wrap_mode=dr.WrapMode.Repeat)
+        factor = dr.exp(mi.Color3f(*grid.eval(mi.Point2f(x, dr.clip(y, 0.5 / _LIGHTS[0], 1 - 0.5 / _LIGHTS[0])))))
+        return self.before * mi.TensorXf(dr.ravel(factor), (rows, columns, 3))
+
+    def image(self, data):
+        return data[:, 1:-1]
+
+
+def _assign(params, learned, optimizer):
+    for part in learned:
+        params[part.key] = part.value(optimizer[part.name])
+    params.update()
+
+
+@dataclass(frozen=True)
+class _Target:
+    sensor: "mi.Sensor"
+    linear: "mi.TensorXf"  # [H, W, 3]
+    weight: "mi.TensorXf"  # [H, W, 3]: s' where the mesh fills the pixel, else 0
+    white: "mi.TensorXf"  # [H, W, 3]: 1 where the photograph is
+    gain: "mi.TensorXf"  # [1, 1, 3]
+    filled: float  # part of the pixels
+
+
+def _target(scene, photograph):
+    pixels = photograph.pixels.astype(np.float32) / (255 if photograph.pixels.dtype == np.uint8 else 1)
+    pixels[..., :3] = srgb_decode(pixels[..., :3]) if photograph.pixels.dtype == np.uint8 else np.clip(pixels[..., :3], 0, 1)
+    side = -(-max(photograph.camera.size) // _LONGEST)
+    width, height = (n // side for n in photograph.camera.size)
+    camera = photograph.camera.cropped(0, 0, width * side, height * side).resized(width, height)
+    pixels = downscale_local_mean(pixels[: height * side, : width * side], (side, side, 1))
+    linear, filled = pixels[..., :3], (pixels[..., 3] > 0.999) & _filled(scene, camera)
+    slope = 1.055 / 2.4 * np.maximum(linear, _DARK) ** (1 / 2.4 - 1)
+    gain = np.ones(3) if photograph.gain is None else photograph.gain
+    arrays = linear, slope * filled[..., None], linear >= _SATURATED, np.reshape(gain, (1, 1, 3))
+    return _Target(mi.load_dict(camera.to_sensor_dict()), *map(as_tensor, arrays), float(filled.mean()))
+
+
+def _filled(scene, camera):
+    """[H, W] which pixels of ``camera`` show nothing but the mesh."""
+    (width, height), (fine, side) = camera.size, camera.subdivided(_GRID**2)
+    index = dr.arange(mi.UInt32, width * height * side * side)
+    ray = mi.Ray3f(opaque(camera).origin, pixel_directions(fine, index))
+    return scene.ray_test(ray).numpy().reshape(height, side, width, side).all((1, 3))
+
+
+def _step(scene, params, integrator, target, seed):
+    """Add the gradient of (20) of one photograph to what is learned; returns its mean squared error."""
+    image = mi.render(
+        scene,
+        params,
+        sensor=target.sensor,
+        integrator=integrator,
+        spp=_SPP,
+        spp_grad=_SPP_GRADIENT,
+        seed=2 * seed,
+        seed_grad=2 * seed + 1,
+    )
+    residual = image[..., :3] * target.gain - target.linear
+    residual = dr.select((target.white > 0) & (residual > 0), 0, residual)
+    residual = dr.clip(residual * target.weight, -_FARTHEST, _FARTHEST)
+    loss = dr.sum(dr.square(residual), axis=None) / dr.opaque(mi.Float, len(residual.array) * max(target.filled, 1e-3))
+    dr.backward(loss)
+    return float(loss.array[0])
