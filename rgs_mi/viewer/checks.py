@@ -17,7 +17,7 @@ def choice(value: object, options: Sequence[str]) -> str | None:
     return value if isinstance(value, str) and value in options else None
 
 
-def same_origin(origin: str | None, host: str | None) -> bool:
+def same_origin(origin: str, host: str | None) -> bool:
     """Return whether what opened a socket is no other site's page, which the same browser shows: its ``origin`` is the ``host``
-    that it asked for (both as headers have them, RFC 6454). What is no browser tells no origin."""
-    return origin is None or host is not None and urlsplit(origin).netloc.lower() == host.lower()
+    that it asked for (both as headers have them, RFC 6454)."""
+    return host is not None and urlsplit(origin).netloc.lower() == host.lower()

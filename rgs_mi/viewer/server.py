@@ -102,11 +102,11 @@ class Server:
         self.wake.set()
 
     async def _turn_away(self, client):
-        """Close the socket of a page of another site; whether it is one."""
+        """Close the socket of a page of another site; whether it is one. What is no browser tells no origin."""
         connection = self._page._websock_server._live_connections[client.client_id]  # viser has no other way to its headers
-        headers = connection.request.headers
+        headers = connection.request.headers if connection.request else {}
         origin = headers.get("Origin")
-        if same_origin(origin, headers.get("Host")):
+        if origin is None or same_origin(origin, headers.get("Host")):
             return False
         if origin not in self._turned_away:  # it asks again and again
             self._turned_away.add(origin)

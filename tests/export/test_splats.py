@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+from rgs_mi.plugins import lit_surfels
 from scipy.spatial.transform import Rotation
 
 from rgs_mi.core.camera import Camera
@@ -10,7 +11,6 @@ from rgs_mi.core.color import srgb_decode, srgb_encode
 from rgs_mi.export import gltf_splat, splat_ply, usd_splat
 from rgs_mi.export.bake import DIRECTIONS, bake, fit
 from rgs_mi.export.splats import Splats, fibonacci_sphere, sh_basis, sh_rotation
-from rgs_mi.plugins import lit_surfels
 from rgs_mi.shading.deferred import render
 
 from readers import glb_splats, harmonics, ply_splats

@@ -137,6 +137,5 @@ def test_values_of_pages_are_checked():
 
 def test_origins():
     assert same_origin("http://localhost:8080", "localhost:8080") and same_origin("https://Lab.org", "lab.org")
-    assert same_origin(None, "localhost:8080")  # no browser
     others = ("http://localhost:8081", "http://evil.org:8080", "null", "http://localhost:8080.evil.org", "")
     assert not any(same_origin(other, "localhost:8080") for other in others) and not same_origin("null", None)

@@ -53,8 +53,8 @@ def build(
             progress.update(0.2 * (k + 1) / len(cameras))
         volume = tsdf.fuse(cameras, depths, box)
         progress.update(0.3)
-        dense = volume and tsdf.surface(volume)
-        if dense is None or not len(dense.faces):
+        dense = None if volume is None else tsdf.surface(volume)
+        if volume is None or dense is None or not len(dense.faces):
             raise UserError(f"{path}: its cameras see no surface of its surfels: there is nothing to export")
         dense = largest_parts(dense)
         tolerance = _TOLERANCE * volume.voxel

@@ -73,7 +73,7 @@ def refine(
     targets = [_target(scene, photograph) for photograph in photographs]
     rng, begin, step, errors = np.random.default_rng(0), time.monotonic(), 0, []
     with Progress(seconds, quiet, "refining") as progress, GracefulInterrupt() as interrupt:
-        while (spent := time.monotonic() - begin) < seconds and not interrupt.requested:
+        while (spent := time.monotonic() - begin) < seconds and interrupt.signal is None:
             if step % len(targets) == 0:
                 order = rng.permutation(len(targets))
             optimizer.set_learning_rate({p.name: _RATES[p.name] * _LAST ** (spent / seconds) for p in learned})
@@ -170,8 +170,14 @@ def _target(scene, photograph):
     linear, filled = pixels[..., :3], (pixels[..., 3] > 0.999) & _filled(scene, camera)
     slope = 1.055 / 2.4 * np.maximum(linear, _DARK) ** (1 / 2.4 - 1)
     gain = np.ones(3) if photograph.gain is None else photograph.gain
-    arrays = linear, slope * filled[..., None], linear >= _SATURATED, np.reshape(gain, (1, 1, 3))
-    return _Target(mi.load_dict(camera.to_sensor_dict()), *map(as_tensor, arrays), float(filled.mean()))
+    return _Target(
+        mi.load_dict(camera.to_sensor_dict()),
+        as_tensor(linear),
+        as_tensor(slope * filled[..., None]),
+        as_tensor(linear >= _SATURATED),
+        as_tensor(np.reshape(gain, (1, 1, 3))),
+        float(filled.mean()),
+    )
 
 
 def _filled(scene, camera):

@@ -93,7 +93,7 @@ def nearest(mesh: UVMesh, texels: Texels, among: np.ndarray | None = None) -> np
     number = np.full(mesh.size[0] * mesh.size[1], -1)
     number[texels.index] = np.arange(len(texels.index)) if among is None else np.where(among, np.arange(len(among)), -1)
     number = number.reshape(mesh.size[::-1])
-    row, column = ndimage.distance_transform_edt(number < 0, return_distances=False, return_indices=True)
+    row, column = np.asarray(ndimage.distance_transform_edt(number < 0, return_distances=False, return_indices=True))
     return number[row, column].ravel()
 
 
