@@ -1,6 +1,5 @@
 """A finished run as a textured mesh: a GLB, and a scene of stock Mitsuba. What `rgs-mi export --to mesh` calls."""
 
-import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -50,7 +49,8 @@ def export_mesh(
     _tell_what_is_lost(path, scene, lighting)
     photographs = _photographs(run, data, needed=bool(minutes))
     seen = [p.camera for p in photographs] or [Camera.from_sensor(sensor) for sensor in scene.sensors()]
-    lit, eta = lighting is not None and lighting.lit, surfels_of(scene, path).eta
+    lit = lighting is not None and scene.integrator().diffuse != "radiance"  # also where base colors stand beside a radiance
+    eta = surfels_of(scene, path).eta
     result = build(surfels, seen, path, lit=lit, eta=eta, box=lighting and lighting.box, quiet=quiet)
     environment = Environment.from_emitter(emitter).texels.numpy() if mapped else None
     write = lambda: stock_scene.write(folder, result.mesh, result.texels, result.textures, eta, environment, path)
@@ -81,7 +81,7 @@ def _photographs(run, data, needed) -> list[Photograph]:
     """The training photographs of a ``run`` with their cameras, as learned where they were; none where they are gone and not
     ``needed``. Raises: UserError where they are needed, or were asked for."""
     try:
-        saved = json.loads((run / results.METRICS).read_text())
+        saved = results.saved_figures(run) or {}
         folder = data or saved.get("photographs")
         if not isinstance(folder, str | Path):
             raise UserError(f"{run / results.METRICS} does not say where the photographs are: give their folder with --data")

@@ -38,7 +38,7 @@ def make_run(folder):
     light = np.random.default_rng(0).uniform(0.2, 0.9, (16, 32, 3))
     mi.Bitmap(np.float32(light)).write(str(folder / "environment.exr"))
     (folder / "scene.xml").write_text(SCENE)
-    (folder / "metrics.json").write_text(json.dumps({"finished": True}))
+    (folder / "metrics.json").write_text(json.dumps({"finished": True, "settings": {}}))
     return folder
 
 

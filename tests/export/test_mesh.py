@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -236,7 +237,7 @@ def make_run(folder, lit=False):
         <emitter type="envmap" id="environment"><string name="filename" value="environment.exr"/>
         <transform name="to_world"><rotate x="1" angle="90"/></transform></emitter>{sensors}</scene>"""
     )
-    (folder / "metrics.json").write_text(json.dumps({"finished": True}))
+    (folder / "metrics.json").write_text(json.dumps({"finished": True, "settings": {}}))
     return folder
 
 
@@ -324,6 +325,19 @@ def photographs_of(folder):
         mask = sphere_depth(camera) > 0
         views.append(Photograph(camera, np.float32(np.concatenate([image, mask[..., None]], -1))))
     return views
+
+
+@pytest.mark.parametrize("exported", [True], ids=["lit"], indirect=True)
+def test_what_is_relightable_is_lit(exported, tmp_path):
+    run, folder = exported
+    other = shutil.copytree(run, tmp_path / "ball", ignore=shutil.ignore_patterns("export"))
+    scene = other / "scene.xml"
+    scene.write_text(scene.read_text().replace('value="lit"', 'value="relightable"'))
+    export(other, "mesh", quiet=True)
+    found = other / "export" / "mesh"
+    assert sorted(path.name for path in found.iterdir()) == sorted(path.name for path in folder.iterdir())
+    colors = [np.float32(np.array(mi.Bitmap(str(path / "base_color.exr")))) for path in (found, folder)]
+    assert np.allclose(*colors, atol=1e-3) and colors[0].std() > 0.05
 
 
 @pytest.mark.parametrize("exported", [False], ids=["radiance"], indirect=True)
