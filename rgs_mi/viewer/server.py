@@ -5,6 +5,7 @@ import io
 import socket
 import sys
 import threading
+import warnings
 from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -130,6 +131,11 @@ class Server:
     def turn(self, idle: bool = True) -> bool:
         """Do one piece of work: what a window has asked for, or one pass of the window that has waited longest, or what can wait,
         or, where ``idle`` work is wanted, compile what another size needs. Return whether there was any."""
+        with warnings.catch_warnings():  # a client may vanish while its picture is drawn
+            warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
+            return self._turn(idle)
+
+    def _turn(self, idle):
         if self._jobs:
             self._jobs.popleft()()
             return True

@@ -225,3 +225,17 @@ def test_two_hundred_events(served, tab):
     wait(lambda: window.generation > generation)
     settled(served)
     assert generation > 50 and tab.errors == []
+
+
+def test_a_window_vanishes_while_it_is_drawn(served, tab):
+    """What is sent to nobody is no warning, which would be an error here."""
+    page = tab.context.browser.new_page(viewport=_WINDOW)
+    page.goto(served.address)
+    settled(served, 2)
+    number = max(served.windows)
+    window, panel = served.windows[number], served._panels[number]
+    page.close()
+    wait(lambda: len(served.windows) == 1)
+    done = []
+    served.ask(lambda: done.append(panel.show(window.work(served.subject, served.pace) or panel._picture)))
+    wait(lambda: done)
