@@ -7,8 +7,10 @@ import rgs_mi
 from fits import random_photographs
 from runs import end_all, make_inputs
 
-# A shell that starts the tests in the background has them ignore Ctrl-C, which processes that they start would inherit.
+# A shell that starts the tests in the background has them ignore Ctrl-C, and nohup a terminal that goes, which processes that
+# they start would inherit.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture(autouse=True)

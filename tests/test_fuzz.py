@@ -280,6 +280,7 @@ signal.signal(signal.SIGPROF, too_long)
 def targets(tmp_path_factory):
     root, before = tmp_path_factory.mktemp("fuzz"), Path.cwd()
     os.chdir(root)  # undistorted photographs are kept below the current folder
+    rgs_mi.set_variant()
     found = write_all(root)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -166,7 +166,10 @@ def test_large_jpegs_are_decoded_small(tmp_path, monkeypatch):
 
 def test_few_are_held_at_full_size(tmp_path, monkeypatch):
     """However many threads load photographs."""
-    write_llff(tmp_path, photographs(24))
+    images = photographs(24)
+    write_llff(tmp_path, images)
+    height, width = next(iter(images.values())).shape[:2]
+    monkeypatch.setattr(frames_module, "_DECODED", 3 * frames_module._work_of((width, height), False))
     there, most, lock, read = 0, 0, threading.Lock(), frames_module.read_image
 
     def counted(*arguments):

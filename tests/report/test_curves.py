@@ -87,7 +87,7 @@ def test_event_files(run):
     lines = (run / "curves.csv").read_text().splitlines()
     names = lines[0].split(",")
     for line in lines[1:]:
-        row = dict(zip(names, map(float, line.split(","))))
+        row = {name: float(cell) for name, cell in zip(names, line.split(",")) if cell}  # some begin later
         assert all(
             scalars.pop((row["step"], name.replace(".", "/"))) == pytest.approx(value)
             for name, value in row.items()
