@@ -253,9 +253,9 @@ def residual(radiance: "mi.Color3f", lit: "mi.Color3f", shown: "mi.Float") -> "m
     """Return the mean absolute difference of the diffuse ``radiance`` of surfels and of what their base color reflects, ``lit``,
     both linear, one entry a surfel, which counts by the area that is ``shown`` of it:
 
-        Σ a |C_d − C_d^lit| / Σ a                                                                   (16)
+        Σ a |C_d − C_d^lit| / Σ a                                                                   (21)
 
-    Photographs leave open what of a radiance is light and what is material; (16) leaves to neither what both can explain."""
+    Photographs leave open what of a radiance is light and what is material; (21) leaves to neither what both can explain."""
     d = dr.abs(radiance - lit)
     return dr.sum(shown * (d.x + d.y + d.z)) / (3 * dr.maximum(dr.sum(shown), 1e-12))
 
