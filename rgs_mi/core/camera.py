@@ -214,6 +214,17 @@ def pixel_rays(camera: Camera, index: "mi.UInt32") -> "mi.Vector3f":
     return R.T @ mi.Vector3f(x, y, 1)
 
 
+def pixels_of(camera: Camera, point: "mi.Point3f") -> "tuple[mi.Float, mi.Float, mi.Float]":
+    """Return (x, y, z) of world-space points: where on the image they are seen, in pixels from its upper left corner, and their
+    camera-space z, which must be positive; see `Camera.project`, its twin on NumPy arrays."""
+    R, origin, f, principal, lens = opaque(camera)
+    p = R @ (point - origin)
+    x, y = p.x / p.z, p.y / p.z
+    if lens is not None:
+        x, y = lens.distort(x, y)
+    return x * f.x + principal.x, y * f.y + principal.y, p.z
+
+
 def pixel_directions(camera: Camera, index: "mi.UInt32") -> "mi.Vector3f":
     """Return `pixel_rays` of unit length."""
     import drjit as dr

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...core.arrays import as_float
-from ...core.camera import Camera, opaque
+from ...core.camera import Camera, opaque, pixels_of
 from ...splat.gbuffer import render_gbuffer
 from ...surfels.surfels import Surfels
 
@@ -73,19 +73,15 @@ def look_up(
 def _add(total, image, camera, depth, point, normal, tolerance):
     """Add what ``camera`` sees in its G-buffer's ``image`` at each ``point`` to ``total``: eleven channels times w, and w."""
     width, height = camera.size
-    R, origin, focal, principal, lens = opaque(camera)
-    p = R @ (point - origin)
-    cosine = dr.dot(dr.normalize(origin - point), normal)
-    x, y = p.x / p.z, p.y / p.z
-    if lens is not None:
-        x, y = lens.distort(x, y)
-    x, y = x * focal.x + principal.x - 0.5, y * focal.y + principal.y - 0.5
+    x, y, z = pixels_of(camera, point)
+    cosine = dr.dot(dr.normalize(opaque(camera).origin - point), normal)
+    x, y = x - 0.5, y - 0.5
     column, row = mi.Int32(dr.floor(x)), mi.Int32(dr.floor(y))
-    seen = (p.z > 0) & (cosine > _GRAZING) & (column >= 0) & (column < width - 1) & (row >= 0) & (row < height - 1)
+    seen = (z > 0) & (cosine > _GRAZING) & (column >= 0) & (column < width - 1) & (row >= 0) & (row < height - 1)
     corners = [(mi.UInt32((row + j) * width + column + i), i, j) for j in (0, 1) for i in (0, 1)]
     slack = dr.opaque(mi.Float, tolerance) / dr.maximum(cosine, _GRAZING)
     for index, _, _ in corners:
-        seen &= dr.abs(dr.gather(mi.Float, depth, index, seen) - p.z) < slack
+        seen &= dr.abs(dr.gather(mi.Float, depth, index, seen) - z) < slack
     x, y = x - dr.floor(x), y - dr.floor(y)
     values = [mi.Float(0)] * 16
     for index, i, j in corners:

@@ -23,7 +23,7 @@ import numpy as np
 from skimage import measure
 
 from ...core.bounding_box import BoundingBox
-from ...core.camera import Camera, opaque, pixel_rays
+from ...core.camera import Camera, opaque, pixel_rays, pixels_of
 from ...targets.meshes import Mesh, weld
 
 BLOCK = 8  # voxels along a block's edge
@@ -138,15 +138,11 @@ def _integrated(cameras, depths, origin, voxel, blocks):
 
 def _signed(camera, depth, point, truncation):
     """s and w of (16) for each ``point``."""
-    R, origin, focal, principal, lens = opaque(camera)
-    p = R @ (point - origin)
-    x, y = p.x / p.z, p.y / p.z
-    if lens is not None:
-        x, y = lens.distort(x, y)
-    column, row = mi.Int32(dr.floor(x * focal.x + principal.x)), mi.Int32(dr.floor(y * focal.y + principal.y))
-    inside = (p.z > 0) & (column >= 0) & (column < camera.size[0]) & (row >= 0) & (row < camera.size[1])
+    x, y, z = pixels_of(camera, point)
+    column, row = mi.Int32(dr.floor(x)), mi.Int32(dr.floor(y))
+    inside = (z > 0) & (column >= 0) & (column < camera.size[0]) & (row >= 0) & (row < camera.size[1])
     d = dr.gather(mi.Float, depth, mi.UInt32(row * camera.size[0] + column), inside)
-    signed = dr.select(d > 0, dr.clip((d - p.z) / truncation, -1, 1), 1)
+    signed = dr.select(d > 0, dr.clip((d - z) / truncation, -1, 1), 1)
     return signed, dr.select(inside, dr.minimum(1 + signed, 1), 0)
 
 
