@@ -10,7 +10,6 @@ import numpy as np
 from ..core.camera import Camera
 from ..core.errors import UserError
 from ..datasets import load_dataset
-from ..datasets.resolution import LONGEST
 from ..export.mesh import gltf, stock_scene
 from ..export.mesh.build import build
 from ..export.mesh.refine import Photograph, refine
@@ -81,11 +80,11 @@ def _photographs(run, data, needed) -> list[Photograph]:
     """The training photographs of a ``run`` with their cameras, as learned where they were; none where they are gone and not
     ``needed``. Raises: UserError where they are needed, or were asked for."""
     try:
-        saved = results.saved_figures(run) or {}
-        folder = data or saved.get("photographs")
-        if not isinstance(folder, str | Path):
+        folder, longest = results.photographs_of(run)
+        folder = data or folder
+        if folder is None:
             raise UserError(f"{run / results.METRICS} does not say where the photographs are: give their folder with --data")
-        views = load_dataset(folder, int(saved.get("settings", {}).get("resolution", LONGEST))).train
+        views = load_dataset(folder, longest).train
     except UserError:
         if needed or data is not None:
             raise

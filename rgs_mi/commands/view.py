@@ -8,9 +8,8 @@ from ..core.errors import UserError
 from ..core.runtime import HOST, PORT
 from ..core.scene_files import load_scene
 from ..datasets import load_dataset
-from ..datasets.resolution import LONGEST
 from ..export.mitsuba_scene import SCENE
-from ..report.results import finished, saved_figures
+from ..report.results import finished, photographs_of
 from ..viewer.exports import Exports
 from ..viewer.server import Server, check
 from ..viewer.subject import Subject
@@ -56,9 +55,8 @@ def _photographs(path, data):
     given and holds none."""
     if data is not None:
         return load_dataset(data).train
-    saved = saved_figures(path) or {}
-    folder, longest = saved.get("photographs"), saved.get("settings", {}).get("resolution", LONGEST)
-    if not isinstance(folder, str) or not isinstance(longest, int):
+    folder, longest = photographs_of(path)
+    if folder is None:
         return []  # of no run
     try:
         return load_dataset(folder, longest).train

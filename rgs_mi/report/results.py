@@ -19,6 +19,7 @@ from ..core.files import write_json, write_png
 from ..core.inputs import JSON, read_file
 from ..core.progress import Progress
 from ..core.runtime import cores, peak_rss_mb, release_memory
+from ..datasets.resolution import LONGEST
 from ..datasets.types import Dataset, View
 from ..evaluation import evaluate, lpips, metrics, pictures
 from ..evaluation.registration import Registered, Registration, register
@@ -179,6 +180,14 @@ def finished(folder: Path) -> bool:
     """Return whether the run in ``folder`` came to its end."""
     saved = saved_figures(folder)
     return saved is not None and saved["finished"]
+
+
+def photographs_of(run: Path) -> tuple[str | None, int]:
+    """Return the folder in which the photographs of the ``run`` were, None where its metrics.json does not say, and the most
+    pixels along a side that they were read with."""
+    saved = saved_figures(run) or {"settings": {}}
+    folder, longest = saved.get("photographs"), saved["settings"].get("resolution", LONGEST)
+    return (folder if isinstance(folder, str) else None), (longest if isinstance(longest, int) else LONGEST)
 
 
 def digests(dataset: Dataset, settings: Settings) -> dict[str, str]:
