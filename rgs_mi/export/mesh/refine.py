@@ -30,7 +30,7 @@ from ...core.interrupt import GracefulInterrupt
 from ...core.progress import Progress
 from .stock_scene import LIGHT
 from .surface import UVMesh
-from .textures import Texels, nearest
+from .textures import Texels
 
 _DEPTH, _SPP, _SPP_GRADIENT = 4, 4, 2
 _LONGEST = 256  # pixels along a photograph's longer side, at most
@@ -95,7 +95,7 @@ class _Texture:
         self.name, self.key = name, next(key for key in params.keys() if key.endswith(f"{name}.data"))
         self.before = as_tensor(params[self.key].numpy())  # a copy: what is assigned is written into the scene's own
         self.vertices = len(mesh.vertices)
-        near = nearest(mesh, texels)
+        near = texels.near
         self.corners = mi.Vector3u(np.ascontiguousarray(mesh.faces[texels.face[near]].T))
         self.weights = mi.Vector3f(*(as_float(texels.barycentric[near, k]) for k in range(3)))
 

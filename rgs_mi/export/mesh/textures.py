@@ -8,6 +8,7 @@ BSDF is that of a metal throughout, whose reflectance at normal incidence is wha
 with metallic m and index of refraction η: metals have no diffuse lobe, and Schlick's Fresnel term nearly the dielectric's.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -41,9 +42,10 @@ class Textures:
 
 @dataclass(frozen=True)
 class Texels:
-    """The T texels of a `UVMesh` on which the center of lies a face: ``index`` (row-major) among all, ``face`` and
-    ``barycentric`` [T, 3] on it, ``points`` and unit ``normals`` [T, 3] there, world space."""
+    """The T texels of a `UVMesh` on which the center of lies a face: ``index`` (row-major) among all of a texture of ``size``
+    (columns, rows), ``face`` and ``barycentric`` [T, 3] on it, ``points`` and unit ``normals`` [T, 3] there, world space."""
 
+    size: tuple[int, int]
     index: np.ndarray
     face: np.ndarray
     barycentric: np.ndarray
@@ -66,13 +68,26 @@ class Texels:
         face, b = hit.prim_index.numpy()[index], hit.prim_uv.numpy().T[index].astype(float)
         barycentric = np.column_stack([1 - b.sum(1), b])
         at = lambda values: np.einsum("tk,tkc->tc", barycentric, values[mesh.faces[face]].astype(float))
-        return cls(index, face, barycentric, at(mesh.vertices), unit(at(mesh.normals)))
+        return cls(mesh.size, index, face, barycentric, at(mesh.vertices), unit(at(mesh.normals)))
+
+    @functools.cached_property
+    def near(self) -> np.ndarray:
+        """Which of these is the nearest one for each texel of the texture, [H · W] row-major."""
+        return self.nearest(np.ones(len(self.index), bool))
+
+    def nearest(self, among: np.ndarray) -> np.ndarray:
+        """Return `near` of those alone where ``among`` [T] holds, anywhere at least."""
+        number = np.full(self.size[0] * self.size[1], -1)
+        number[self.index] = np.where(among, np.arange(len(among)), -1)
+        number = number.reshape(self.size[::-1])
+        row, column = np.asarray(ndimage.distance_transform_edt(number < 0, return_distances=False, return_indices=True))
+        return number[row, column].ravel()
 
 
 def textures(mesh: UVMesh, texels: Texels, seen: Seen, lit: bool, eta: float) -> Textures:
     """Return the `Textures` of a ``mesh`` from what was ``seen`` at its ``texels``; ``lit`` says whether surfels have no radiance
     of their own, and ``eta`` is their index of refraction. What no camera sees is like the nearest that one does."""
-    near = nearest(mesh, texels, seen.known if seen.known.any() else None)
+    near = texels.nearest(seen.known) if seen.known.any() else texels.near
     filled = lambda values: values[near].reshape(*mesh.size[::-1], -1).astype(np.float32)
     base_color, metallic = np.clip(seen.base_color, 0, 1), np.clip(seen.metallic, 0, 1)
     if not lit:
@@ -82,19 +97,9 @@ def textures(mesh: UVMesh, texels: Texels, seen: Seen, lit: bool, eta: float) ->
         filled(base_color),
         filled(np.clip(seen.roughness, 0, 1)),
         filled(metallic),
-        normal[nearest(mesh, texels)].reshape(*mesh.size[::-1], 3).astype(np.float32),
+        normal[texels.near].reshape(*mesh.size[::-1], 3).astype(np.float32),
         None if lit else filled(seen.radiance),
     )
-
-
-def nearest(mesh: UVMesh, texels: Texels, among: np.ndarray | None = None) -> np.ndarray:
-    """Return for each texel of a texture, [H · W] row-major, which of ``texels`` is the nearest one, of those where ``among`` [T]
-    holds (None: of all)."""
-    number = np.full(mesh.size[0] * mesh.size[1], -1)
-    number[texels.index] = np.arange(len(texels.index)) if among is None else np.where(among, np.arange(len(among)), -1)
-    number = number.reshape(mesh.size[::-1])
-    row, column = np.asarray(ndimage.distance_transform_edt(number < 0, return_distances=False, return_indices=True))
-    return number[row, column].ravel()
 
 
 # ---- Tangent space ----
@@ -104,7 +109,7 @@ def normal_map(mesh: UVMesh, texels: Texels, normal: np.ndarray, frames: Callabl
     """Return the ``normal`` [H, W, 3] of a texture, world space, in the ``frames`` of its texels (`mitsuba_frames` or
     `gltf_frames`), in [0, 1] as images have it: n / 2 + ½."""
     local = unit(np.einsum("tij,tj->ti", frames(mesh, texels), normal.reshape(-1, 3)[texels.index]))
-    return (local[nearest(mesh, texels)].reshape(*mesh.size[::-1], 3) / 2 + 0.5).astype(np.float32)
+    return (local[texels.near].reshape(*mesh.size[::-1], 3) / 2 + 0.5).astype(np.float32)
 
 
 def mitsuba_frames(mesh: UVMesh, texels: Texels) -> np.ndarray:
