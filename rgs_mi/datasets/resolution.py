@@ -16,9 +16,8 @@ LONGEST = 1600
 def chosen(folder: Path, side: float, longest: int = LONGEST) -> Path:
     """Return ``folder`` or the smaller copy beside it, for photographs whose longer side is ``side`` pixels in ``folder``
     and should be ``longest`` at most."""
-    choices = (
-        {1: folder} if os.path.isdir(folder) else {}
-    )  # unlike Path's it answers False to names that no file system takes
+    # unlike Path's, os.path's answers False to names that no file system takes
+    choices = {1: folder} if os.path.isdir(folder) else {}
     if (side > longest or not choices) and os.path.isdir(folder.parent):
         for name in os.listdir(folder.parent):
             match = re.fullmatch(re.escape(folder.name) + r"_([1-9]\d{0,2})", name)

@@ -99,6 +99,7 @@ class Objective:
     def residual(self, surfels: Surfels, lighting: Lighting, camera: Camera) -> "mi.Float":
         """Return the weighted part of the ``surfels``' diffuse radiance, as ``camera`` sees them, that is not what their base
         color reflects under ``lighting``; of width 1."""
+        surfels = surfels.split()
         center = dr.detach(surfels.column(mi.Point3f, "centers"))
         view = dr.normalize(opaque(camera, len(surfels)).origin - center)
         scales, opacity = surfels.column(mi.Vector2f, "scales"), surfels.column(mi.Float, "opacities")

@@ -28,9 +28,10 @@ def warm(subject: Subject, grid: int) -> None:
     if subject.changing:
         return draw(subject, grid)
     first, last = subject.cameras[0], subject.cameras[-1]
+    cameras = first, _behind(subject, first), last, _turned_away(first), _close(subject, first, grid)
     looks = [Look(first)] + [Look(first, rotate=90)] * (subject.shading.diffuse == "relightable")
     for look in looks:
-        for camera in (first, _behind(subject, first), last, _turned_away(first), _close(subject, first, grid)):
+        for camera in cameras:
             for background in ("white", "light"):
                 seen = replace(look, camera=camera, background=background)
                 measure(subject, seen, camera.resized(grid, grid), settled=False)
