@@ -171,6 +171,7 @@ def finished(run):
         until = time.perf_counter() + wait
         while server.turn() and time.perf_counter() < until:
             pass
+        panel.pictures.clear()
         if k % 200 == 0:
             told.append(f"{megabytes():.0f}")
     print("memory after 0, 200, 400, 600 events, MB:", ", ".join(told))

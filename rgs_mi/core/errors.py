@@ -57,7 +57,10 @@ def run_main(main: Callable[[], int | str | None]) -> NoReturn:
         except MemoryError as error:
             print(f"error: out of memory ({one_line(error)}): use fewer or smaller photographs", file=sys.stderr)
             sys.exit(2)
-        except KeyboardInterrupt as stop:
+        except (KeyboardInterrupt, RuntimeError) as error:
+            stop = _stop_behind(error)
+            if stop is None:
+                raise
             stopped = stop if isinstance(stop, Stopped) else Stopped(signal.SIGINT)
             print(stopped, file=sys.stderr)
             sys.exit(stopped.code)
@@ -77,6 +80,14 @@ def _terminable():
     finally:
         if main:
             signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+
+
+def _stop_behind(error):
+    """The KeyboardInterrupt that ``error`` is, or was caused by: what comes while Dr.Jit calls Python it wraps. None if there is
+    none."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__
+    return error
 
 
 def _print_warning(message, *_, **__):

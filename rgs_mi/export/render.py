@@ -7,7 +7,6 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from ..core.camera import Camera, focus_point
@@ -242,6 +241,8 @@ def _along(scene, path, frames, given=None):
 def smooth_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """Return ``frames`` cameras on a smooth path through two ``cameras`` or more, of one size, about the point that they look
     at."""
+    from scipy.interpolate import PchipInterpolator  # for which a window need not wait
+
     size = cameras[0].size
     center, _ = focus_point(cameras)
     knots, times = np.arange(len(cameras)), np.linspace(0, len(cameras) - 1, frames)

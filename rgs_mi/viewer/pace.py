@@ -14,7 +14,7 @@ _SMOOTHING = 0.7
 class Pace:
     """Which of `GRIDS` to draw next.
 
-    ``seconds``: what a frame of each grid took when it was made `warm`. Later frames say by how much the machine is slower, or
+    ``seconds``: what a frame of each grid took when it was warm. Later frames say by how much the machine is slower, or
     faster, than it was then.
     """
 
@@ -27,15 +27,16 @@ class Pace:
         """The smallest grid that was not drawn yet; None once all are warm."""
         return next((grid for grid in GRIDS if grid not in self.seconds), None)
 
-    def warm(self, grid: int, compile: Callable[[int], object], draw: Callable[[int], object]) -> None:
-        """Have ``compile(grid)`` compile what the grid needs, and measure ``draw(grid)``."""
-        compile(grid)
+    def measure(self, grid: int, draw: Callable[[int], object]) -> None:
+        """Measure ``draw(grid)``, for which all is compiled."""
         start = time.perf_counter()
         draw(grid)
         self.seconds[grid] = time.perf_counter() - start
 
     def note(self, grid: int, seconds: float) -> None:
-        """Take note of a frame that took so many ``seconds``."""
+        """Take note of a frame that took so many ``seconds``; those of a grid that is not warm yet say nothing."""
+        if grid not in self.seconds:
+            return
         ratio = seconds / self.seconds[grid]
         self._slower = _SMOOTHING * self._slower + (1 - _SMOOTHING) * min(max(ratio, 0.1), 10.0)
 

@@ -7,7 +7,7 @@ import sys
 import threading
 import warnings
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -54,6 +54,7 @@ class Server:
         self._later: deque[Callable[[], None]] = deque()  # and that can wait
         self._panels: dict[int, Panel] = {}
         self._turns: deque[int] = deque()  # windows, the one that has waited longest first
+        self._warming: Iterator[None] | None = None  # what another size needs, begun
         self._turned_away: set[str] = set()  # origins of other sites' pages
         self._page = _open(host, port)
         self.address = f"http://{host}:{self._page.get_port()}"
@@ -129,8 +130,9 @@ class Server:
         self.wake.set()
 
     def turn(self, idle: bool = True) -> bool:
-        """Do one piece of work: what a window has asked for, or one pass of the window that has waited longest, or what can wait,
-        or, where ``idle`` work is wanted, compile what another size needs. Return whether there was any."""
+        """Do one piece of work: what a window has asked for, or the first picture of one, or compile some of what the smallest
+        size needs, or one pass of the window that has waited longest, or what can wait, or, where ``idle`` work is wanted, some of
+        what another size needs. Return whether there was any."""
         with warnings.catch_warnings():  # a client may vanish while its picture is drawn
             warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
             return self._turn(idle)
@@ -139,17 +141,19 @@ class Server:
         if self._jobs:
             self._jobs.popleft()()
             return True
-        if not self.pace.seconds:
-            self._warm(GRIDS[0])
-            return True
-        for number in list(self._turns):
-            window = self.windows.get(number)
-            if window is not None and window.due() == 0:
-                with contextlib.suppress(ValueError):  # it may leave meanwhile
-                    self._turns.remove(number)
-                    self._turns.append(number)
-                self._draw(number, window)
+        windows = [(number, self.windows.get(number)) for number in list(self._turns)]
+        due = [(number, window) for number, window in windows if window is not None and window.due() == 0]
+        if not self.pace.seconds:  # of a fit, what is compiled is no part of a picture's time
+            due = [(number, window) for number, window in due if window.blank and not self.subject.changing]
+            if not due:
+                self._warm(GRIDS[0])
                 return True
+        for number, window in due[:1]:
+            with contextlib.suppress(ValueError):  # it may leave meanwhile
+                self._turns.remove(number)
+                self._turns.append(number)
+            self._draw(number, window)
+            return True
         if self._later:
             self._later.popleft()()
             return True
@@ -174,8 +178,13 @@ class Server:
             panel.show(picture)
 
     def _warm(self, grid):
-        """Compile what a grid needs, and measure it."""
-        self.pace.warm(grid, lambda grid: warm(self.subject, grid), lambda grid: draw(self.subject, grid))
+        """Compile some of what a grid needs, and measure it after the last."""
+        self._warming = self._warming or warm(self.subject, grid)
+        try:
+            next(self._warming)
+        except StopIteration:
+            self._warming = None
+            self.pace.measure(grid, lambda grid: draw(self.subject, grid))
 
 
 def _camera(client):

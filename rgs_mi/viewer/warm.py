@@ -1,5 +1,6 @@
 """All kernels that pictures of one size may need, compiled beforehand."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import drjit as dr
@@ -20,13 +21,14 @@ def draw(subject: Subject, grid: int) -> None:
     to_8bit(picture_of(subject, look, camera, measure(subject, look, camera, settled=False)))
 
 
-def warm(subject: Subject, grid: int) -> None:
-    """Compile what pictures of ``grid`` × ``grid`` points need, whatever they show: from two places, for what is the same in
-    both is compiled in; with the light behind the object; where no reflected ray meets it; where nothing else is seen, and where
-    it is not seen at all. Under another light what is relightable needs others. Of a fit in progress, which changes what it
-    needs, one picture."""
+def warm(subject: Subject, grid: int) -> Iterator[None]:
+    """Compile what pictures of ``grid`` × ``grid`` points need, whatever they show, bit by bit: from two places, for what is the
+    same in both is compiled in; with the light behind the object; where no reflected ray meets it; where nothing else is seen,
+    and where it is not seen at all. Under another light what is relightable needs others. Of a fit in progress, which changes
+    what it needs, one picture, at once."""
     if subject.changing:
-        return draw(subject, grid)
+        draw(subject, grid)
+        return
     first, last = subject.cameras[0], subject.cameras[-1]
     cameras = first, _behind(subject, first), last, _turned_away(first), _close(subject, first, grid)
     looks = [Look(first)] + [Look(first, rotate=90)] * (subject.shading.diffuse == "relightable")
@@ -35,6 +37,7 @@ def warm(subject: Subject, grid: int) -> None:
             for background in ("white", "light"):
                 seen = replace(look, camera=camera, background=background)
                 measure(subject, seen, camera.resized(grid, grid), settled=False)
+                yield
         lit = subject.lit(look, settled=False)
         if lit.lighting is not None and lit.lighting.indirect is not None:
             alone = replace(lit.lighting, indirect=replace(lit.lighting.indirect, kind="visibility"))

@@ -70,8 +70,13 @@ class Window:
 
     @property
     def moving(self) -> bool:
-        """Whether the last event was a moment ago."""
-        return time.monotonic() - self.moved < REST
+        """Whether the last event was a moment ago, or there is no picture yet."""
+        return self.blank or time.monotonic() - self.moved < REST
+
+    @property
+    def blank(self) -> bool:
+        """Whether nothing was drawn yet."""
+        return max(self._moving, self._refining) < 0
 
     def due(self) -> float:
         """Return in how many seconds there is something to draw: 0 for now, infinity for never, unless something happens."""

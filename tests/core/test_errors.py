@@ -3,6 +3,8 @@
 import signal
 import warnings
 
+import drjit as dr
+import mitsuba as mi
 import pytest
 
 from rgs_mi.core.errors import Stopped, UserError, run_main
@@ -51,6 +53,15 @@ def test_signals_have_their_codes(capsys):
         raise Stopped(signal.SIGINT, "stopped at 3%")
 
     assert outcome(stop, capsys) == (130, "stopped at 3%\n")
+
+
+def test_signals_that_come_inside_dr_jit_have_their_codes(capsys):
+    class Stopping(dr.CustomOp):
+        def eval(self, x):
+            signal.raise_signal(signal.SIGTERM)
+            return x
+
+    assert outcome(lambda: dr.custom(Stopping, mi.Float(1)), capsys) == (143, "interrupted\n")
 
 
 def test_out_of_memory_is_a_line(capsys):

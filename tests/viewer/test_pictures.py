@@ -128,6 +128,8 @@ def test_poses_come_back():
 def test_a_move_interrupts_what_is_at_rest(subject, monkeypatch):
     monkeypatch.setattr(window, "REST", 0)
     seen, pace = window.Window(Look(CAMERA)), paced(1e-8)
+    assert seen.blank and seen.due() == 0
+    assert seen.work(subject, pace).part is None and not seen.blank  # the first picture is a quick one
     shown = [seen.work(subject, pace) is not None for _ in range(17)]
     assert [k + 1 for k, there in enumerate(shown) if there] == [1, 5, 9, 13, 17] and seen.due() == float("inf")
 
@@ -170,7 +172,8 @@ def test_no_change_is_no_change():
 def test_nothing_is_compiled_after_warming_up(subject):
     """Whatever varies from frame to frame: poses, light, materials, exposure, maps, backgrounds."""
     grid, rng = GRIDS[0], np.random.default_rng(3)
-    warm(subject, grid)
+    for _ in warm(subject, grid):
+        pass
     draw(subject, grid)
     dr.set_flag(dr.JitFlag.KernelHistory, True)
     try:

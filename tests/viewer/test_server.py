@@ -88,13 +88,25 @@ def test_windows_take_turns(server):
     (first, one), (second, two) = enter(server, 1), enter(server, 2, orbit_camera(2, size=(56, 48)))
     for opened in (first, second):
         opened.moved -= 1  # at rest
-    for _ in range(8):
+    for _ in range(10):
         assert server.turn(idle=False)
-    assert first.refined.passes == second.refined.passes == 4 and len(one.pictures) == len(two.pictures) == 1
+    assert first.refined.passes == second.refined.passes == 4 and len(one.pictures) == len(two.pictures) == 2
     server.windows.pop(1)  # it vanishes
     for _ in range(13):
         assert server.turn(idle=False)
     assert not server.turn(idle=False) and first.refined.passes == 4 and second.refined.complete
+
+
+def test_a_first_picture_does_not_wait_until_all_is_compiled(server):
+    """Then what moves waits until the smallest size is."""
+    server.pace.seconds.clear()
+    assert server.turn(idle=False) and not server.pace.seconds  # nobody looks yet
+    opened, panel = enter(server, 1)
+    assert server.turn(idle=False) and len(panel.pictures) == 1 and not server.pace.seconds
+    opened.change(camera=orbit_camera(1, size=(56, 48)))
+    while not server.pace.seconds:
+        assert server.turn(idle=False) and len(panel.pictures) == 1
+    assert server.turn(idle=False) and len(panel.pictures) == 2
 
 
 def test_the_last_move_counts(server, monkeypatch):
