@@ -131,8 +131,8 @@ class Server:
 
     def turn(self, idle: bool = True) -> bool:
         """Do one piece of work: what a window has asked for, or the first picture of one, or compile some of what the smallest
-        size needs, or one pass of the window that has waited longest, or what can wait, or, where ``idle`` work is wanted, some of
-        what another size needs. Return whether there was any."""
+        size needs, or one pass of the window that has waited longest, or what can wait, or, where ``idle`` work is wanted,
+        some of what another size needs. Return whether there was any."""
         with warnings.catch_warnings():  # a client may vanish while its picture is drawn
             warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
             return self._turn(idle)
