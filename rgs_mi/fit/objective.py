@@ -1,6 +1,6 @@
 """The objective of a fit: what a rendered view costs, term by term (docs/method.md §4)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +14,7 @@ from ..shading import deferred
 from ..shading.lighting import Lighting
 from ..splat.gbuffer import GBuffer
 from ..splat.tiles import Cutoffs
-from ..surfels.surfels import Surfels
+from ..surfels.surfels import CHANNELS, Surfels
 from . import losses
 from .reflection_guided import reflective_mask
 
@@ -98,9 +98,14 @@ class Objective:
 
     def residual(self, surfels: Surfels, lighting: Lighting, camera: Camera) -> "mi.Float":
         """Return the weighted part of the ``surfels``' diffuse radiance, as ``camera`` sees them, that is not what their base
-        color reflects under ``lighting``; of width 1."""
-        surfels = surfels.split()
-        center = dr.detach(surfels.column(mi.Point3f, "centers"))
+        color reflects under ``lighting``; of width 1. It has gradients in that radiance, base color and metallic alone: the light
+        is what reflections say that it is."""
+        learned = "sh", "base_color", "metallic"
+        surfels = replace(
+            surfels, **{name: dr.detach(getattr(surfels, name)) for name in CHANNELS if name not in learned}
+        ).split()
+        lighting = lighting.with_learned([dr.detach(v) for v in lighting.learned()], surfels)
+        center = surfels.column(mi.Point3f, "centers")
         view = dr.normalize(opaque(camera, len(surfels)).origin - center)
         scales, opacity = surfels.column(mi.Vector2f, "scales"), surfels.column(mi.Float, "opacities")
         cosine = dr.dot(surfels.frames()[2], view)
@@ -108,9 +113,7 @@ class Objective:
         if self.box is not None:
             shown = dr.select(self.box.contains(center), shown, 0)
         lit = lighting.seen_by(camera, len(surfels)).lit_radiance(surfels, view)
-        return dr.opaque(mi.Float, self.settings.weights.residual) * losses.residual(
-            surfels.radiance(-view), lit, dr.detach(shown)
-        )
+        return dr.opaque(mi.Float, self.settings.weights.residual) * losses.residual(surfels.radiance(-view), lit, shown)
 
     def reflective_mask(self, gbuffer: GBuffer, camera: Camera) -> np.ndarray:
         """Return β̂ of a view, [H, W] bool: which pixels are reflective."""

@@ -21,6 +21,8 @@ from . import losses, reflection_guided
 from .cameras import Cameras
 from .curves import Curves
 from .density import DensityControl
+from .light_maps import STEPS as FILTERED_EVERY
+from .light_maps import LightMaps
 from .model import ENVIRONMENT, Model
 from .objective import CUTOFFS, Objective
 from .plan import LAST, LEAST_STEPS, STEPS
@@ -28,6 +30,7 @@ from .schedule import Schedule
 from .turns import Turns
 
 _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
+_HIDE = 4  # such trees from one time that it is asked what surfels hide of the light to the next
 _PACE = 31  # steps whose median says how long one takes
 _DIVERGED = 10  # steps in a row without a finite error
 
@@ -82,11 +85,13 @@ class Fit:
         self.proxies: Proxies | None = None
         self.irradiance_visibility: mi.Color3f | None = None
         self.emitter: mi.Emitter | None = None
+        self._light = LightMaps()
 
     # ---- State ----
 
     def state(self) -> tuple[dict, dict]:
-        """(arrays, meta) for a checkpoint: with `resume` the fit goes on as if it had not been interrupted."""
+        """(arrays, meta) for a checkpoint: with `resume` the fit goes on as if it had not been interrupted, but for gradients of
+        the environment that have not reached it yet (`LightMaps`)."""
         gradients = self.density.gradients
         arrays = {"gradient_sum": gradients.sum.numpy(), "gradient_count": gradients.count.numpy()}
         meta = {"step": self.step_number, "views_used": self.views_used, "elapsed": self.elapsed, "extent": self.extent}
@@ -159,14 +164,15 @@ class Fit:
         shading = self.shading
         if shading.specular == "none":
             return None
-        learned, shader, sampled = self.model.environment(), self.model.shader(), shading.specular == "monte_carlo"
-        environment = learned.unfiltered() if sampled else learned.filtered()
+        shader, sampled = self.model.shader(), shading.specular == "monte_carlo"
         if not training:
+            learned = self.model.environment()
+            environment = learned.unfiltered() if sampled else learned.filtered()
             return lighting_of(shading, surfels, environment, learned.emitter() if sampled else None, shader)
         return lighting_of(
             replace(shading, samples=self.settings.monte_carlo_samples),
             surfels,
-            environment,
+            self._light.see(self.model, not sampled),
             self.emitter,
             shader,
             seed=self.step_number,
@@ -178,16 +184,28 @@ class Fit:
     def _refresh(self, surfels):
         """Rebuild what serves many steps."""
         shading, due = self.shading, self.step_number % _REBUILD == 0
+        sampled = shading.specular == "monte_carlo"
         if due or self.emitter is None:
-            self.emitter = self.model.environment().emitter() if shading.specular == "monte_carlo" else None
+            self.emitter = self.model.environment().emitter() if sampled else None
+        if sampled:
+            self.irradiance_visibility = None  # its rays say by themselves what is hidden
         if due or self.proxies is None:
-            self.proxies = self.irradiance_visibility = None
+            others = self.proxies is None or self.step_number % (_HIDE * _REBUILD) == 0
+            self.proxies = None
             if shading.indirect != "none":
                 self.proxies = Proxies(surfels, box=shading.box)
-                explained = shading.diffuse == "lit" or self.schedule.explains(self.progress)
-                if explained and (lighting := self.lighting(surfels, training=True)):
-                    lighting = lighting if lighting.lit else lighting.with_irradiance_visibility(self.step_number)
-                    self.irradiance_visibility = lighting.indirect and lighting.indirect.irradiance_visibility
+            if others or self.irradiance_visibility is None:
+                self.irradiance_visibility = self._hidden(surfels)
+
+    def _hidden(self, surfels):
+        """What ``surfels`` hide of the light; None where nothing asks."""
+        self.irradiance_visibility = None
+        explained = self.shading.diffuse == "lit" or self.schedule.explains(self.progress)
+        lighting = self.lighting(surfels, training=True) if self.proxies and explained else None
+        if lighting is None:
+            return None
+        lighting = lighting if lighting.lit else lighting.with_irradiance_visibility(self.step_number)
+        return lighting.indirect and lighting.indirect.irradiance_visibility
 
     # ---- One step ----
 
@@ -207,9 +225,9 @@ class Fit:
         surfels = self.model.surfels(self.sh_order)
         self._refresh(surfels)
         lighting = self.lighting(surfels, training=True)
-        measured = self._backward(views, surfels, lighting)
-        if lighting and (loss := self.objective.environment(self.model[ENVIRONMENT])) is not None:
-            dr.backward(loss)
+        measured, reached = self._backward(views, surfels, lighting)
+        if reached and (loss := self.objective.environment(self.model[ENVIRONMENT])) is not None:
+            dr.backward(loss * FILTERED_EVERY)
             measured.append({"loss.environment_tv": dr.detach(loss)})
         self.model.optimizer.step()
         if self.cameras:
@@ -247,7 +265,8 @@ class Fit:
         return chosen
 
     def _backward(self, views, surfels, lighting):
-        """Gradients of the mean loss of ``views``; returns what each of them measured."""
+        """Gradients of the mean loss of ``views``; returns what each of them measured, and whether those of the last steps have
+        reached the environment."""
         # The views share what lies before them: their gradients meet in leaves there, and go the rest of the way once.
         shared = [*(getattr(surfels, name) for name in CHANNELS), *(lighting.learned() if lighting else [])]
         leaves = [type(v)(dr.detach(v)) for v in shared]
@@ -260,12 +279,17 @@ class Fit:
             loss = self.objective.residual(surfels, lighting, self.dataset.train[views[0]].camera)
             dr.backward(loss)
             measured.append({"loss.residual": dr.detach(loss)})
-        for value, leaf in zip(shared, leaves):
+        light = len(CHANNELS) if lighting else -1
+        for k, (value, leaf) in enumerate(zip(shared, leaves)):
             gradient = dr.grad(leaf)
-            dr.set_grad(value, dr.select(dr.isfinite(gradient), gradient, 0))  # one overflow must not end a fit
+            gradient = dr.select(dr.isfinite(gradient), gradient, 0)  # one overflow must not end a fit
+            if k == light:
+                reached = self._light.gather(self.model, self.step_number, gradient)
+                continue
+            dr.set_grad(value, gradient)
             dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
-        return measured
+        return measured, lighting is not None and reached
 
     def _view(self, i, surfels, lighting, weight):
         """Accumulate the gradients of view ``i``; returns its loss's terms and the mean squared ``error``."""

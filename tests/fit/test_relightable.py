@@ -115,5 +115,9 @@ def test_the_residual_and_its_gradient():
     facing = (surfels.numpy()["centers"] @ camera.origin) > 1.2  # well within what is seen
     step = np.where(facing[:, None], 3e-3 * np.sign(gradient), 0)
     difference = (loss(colors + step)[0] - loss(colors - step)[0]) / 2
+    texels = lighting.estimator.environment.texels
+    dr.enable_grad(texels, surfels.centers, surfels.roughness)
+    loss(colors)
+    assert not any(dr.grad(v).numpy().any() for v in (texels, surfels.centers, surfels.roughness))  # it moves no light
     assert value > 0.05 * weight and abs((gradient * step).sum() / difference - 1) < 0.03
     assert abs(gradient[facing]).max() > 0 and (gradient[(surfels.numpy()["centers"] @ camera.origin) < 0.9] == 0).all()

@@ -15,6 +15,7 @@ from rgs_mi.datasets.photographs import Photographs
 from rgs_mi.datasets.types import DepthPrior
 from rgs_mi.fit import losses, schedule
 from rgs_mi.fit.density import Gradients
+from rgs_mi.fit.light_maps import STEPS, LightMaps
 from rgs_mi.fit.trainer import Fit
 from rgs_mi.settings.settings import Density, Initialization, LearningRates, Settings, Stage, Weights
 from rgs_mi.shading import deferred
@@ -255,15 +256,15 @@ def test_no_kernel_is_compiled_after_warm_up(dataset, indirect, diffuse, monkeyp
 
 def test_resume_goes_on_where_it_stopped(dataset):
     whole = Fit(dataset, model(), SETTINGS, 1.0)
-    for _ in range(12):
+    for _ in range(4 * STEPS):
         whole.step()
     half = Fit(dataset, model(), SETTINGS, 1.0)
-    for _ in range(6):
+    for _ in range(2 * STEPS):
         half.step()
     again = Fit.resume(dataset, SETTINGS, *half.state())
-    for _ in range(6):
+    for _ in range(2 * STEPS):
         again.step()
-    assert again.step_number == 12 and again.views_used == 12
+    assert again.step_number == again.views_used == 4 * STEPS
     # Atomic additions round differently from run to run. Measured, the largest of eight pairs: 1.2e-7, 6e-6, 6e-6 and 1e-6 dB;
     # without the moments, or with views from the beginning, 6e-4, 0.07, 0.07 and 0.1 dB.
     for name, tolerance in (("centers", 5e-6), ("logit_opacities", 3e-4), ("log_environment", 3e-4)):
@@ -375,6 +376,28 @@ def test_environment_gets_the_rows_that_photographs_tell_apart(dataset, monkeypa
     resumed.step()
     moved = np.abs(resumed.model.numpy("log_environment") - before).max()
     assert before.shape[0] == rows and 0 < moved < 0.1
+
+
+def test_gradients_of_some_steps_reach_the_environment_together():
+    """Their sum, in the maps of the first, whatever the optimizer has made of the environment meanwhile."""
+    learned, still, maps, rng = model(), model(), LightMaps(), np.random.default_rng(0)
+    logarithm = still["log_environment"]
+    dr.enable_grad(logarithm, learned["log_environment"])
+    for step in range(STEPS):
+        seen = maps.see(learned, filtered=True)
+        gradient = mi.Float(rng.normal(size=dr.width(seen.texels)))
+        dr.backward(dr.dot(still.environment().filtered().texels, gradient))
+        reached = maps.gather(learned, step, gradient)
+        assert reached == (step == STEPS - 1) and (abs(dr.grad(learned["log_environment"]).numpy()).max() > 0) == reached
+        if not reached:
+            learned.set("log_environment", learned.numpy("log_environment") + 0.01, reset=False)
+            dr.enable_grad(learned["log_environment"])
+    expected = dr.grad(logarithm).numpy()
+    np.testing.assert_allclose(
+        dr.grad(learned["log_environment"]).numpy(), expected, rtol=1e-4, atol=1e-4 * abs(expected).max()
+    )
+    again = maps.see(learned, filtered=True)
+    np.testing.assert_allclose(again.texels.numpy(), seen.texels.numpy() * np.exp(0.03), rtol=1e-3)
 
 
 def test_a_finer_environment_goes_on_with_the_moments_that_it_would_have():

@@ -1,0 +1,46 @@
+"""The environment's maps along a fit: filtered once for several steps, whose gradients reach the environment together."""
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+
+from ..shading.environment import FilteredEnvironment
+from .model import ENVIRONMENT, Model
+
+#: Steps from one filtering to the next. An environment changes slowly, and filtering it is no work for threads.
+STEPS = 4
+
+
+class LightMaps:
+    """What `Environment.filtered`, or `unfiltered`, gave of a ``model``'s environment at most `STEPS` steps ago."""
+
+    def __init__(self) -> None:
+        self._maps: FilteredEnvironment | None = None
+        self._of: tuple | None = None  # the parameter that was filtered, and whether it was
+        self._gradient: mi.Float | None = None
+
+    def see(self, model: Model, filtered: bool) -> FilteredEnvironment:
+        """Return the environment as a step has it, ``filtered`` or as it is."""
+        environment, parameter = model.environment(), model[ENVIRONMENT]
+        if self._of is None or self._of[1] != filtered or self._of[0].shape != parameter.shape:
+            self._maps = environment.filtered() if filtered else environment.unfiltered()
+            self._of, self._gradient = (parameter, filtered), None
+        return replace(self._maps, environment=environment)
+
+    def gather(self, model: Model, step: int, gradient: "mi.Float") -> bool:
+        """Take the ``gradient`` of step number ``step`` in the maps that it has seen. The last of `STEPS` passes the sum on to
+        the ``model``'s environment, which is filtered again for the next; returns whether it did."""
+        assert self._maps is not None and self._of is not None, "see() comes first"
+        self._gradient = gradient if self._gradient is None else self._gradient + gradient
+        if (step + 1) % STEPS:
+            dr.eval(self._gradient)
+            return False
+        dr.set_grad(self._maps.texels, self._gradient)
+        dr.enqueue(dr.ADMode.Backward, self._maps.texels)
+        dr.traverse(dr.ADMode.Backward)
+        parameter = model[ENVIRONMENT]
+        if parameter.array.index_ad != self._of[0].array.index_ad:
+            dr.accum_grad(parameter, dr.grad(self._of[0]))
+        self._maps = self._of = self._gradient = None
+        return True
