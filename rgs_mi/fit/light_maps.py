@@ -26,6 +26,7 @@ class LightMaps:
         if self._of is None or self._of[1] != filtered or self._of[0].shape != parameter.shape:
             self._maps = environment.filtered() if filtered else environment.unfiltered()
             self._of, self._gradient = (parameter, filtered), None
+        assert self._maps is not None
         return replace(self._maps, environment=environment)
 
     def gather(self, model: Model, step: int, gradient: "mi.Float") -> bool:
