@@ -24,7 +24,7 @@ import browser
 from runs import PATIENCE, ROOT
 
 SIZE = 400, 400
-STRETCH = 25  # steps of a fit with the same windows
+STRETCH = 75  # steps of a fit with the same windows: fewer would count debts that later ones pay back
 RATE = 60  # moves a second
 
 
@@ -237,7 +237,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, nargs="?")
     parser.add_argument("--fit", type=Path, metavar="SCENE")
-    parser.add_argument("--steps", type=int, default=2000)
+    parser.add_argument("--steps", type=int, default=4000)
     args = parser.parse_args()
     rgs_mi.set_variant("llvm_ad_rgb")
     if args.run:
