@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from ..core.errors import UserError
@@ -40,10 +39,8 @@ def view(
     check(host, port)
     path = Path(path)
     scene = path / SCENE if path.is_dir() else path
-    with ThreadPoolExecutor(1) as pool:
-        views = pool.submit(_photographs, path, data)
-        subject = Subject.of(load_scene(scene, variables or {}), envmaps)  # whose light is filtered meanwhile, in a thread
-        subject.compare_with(views.result())
+    subject = Subject.of(load_scene(scene, variables or {}), envmaps)  # whose light is filtered meanwhile, in a thread
+    subject.compare_with(_photographs(path, data))
     offer = Exports(FORMATS, lambda to: export(path, to, quiet=True)).offer if finished(path) else None
     server = Server(subject, str(path), host, port, offer)
     print(f"{server.address} (Ctrl-C closes it)", flush=True)

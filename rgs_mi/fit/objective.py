@@ -100,10 +100,8 @@ class Objective:
         """Return the weighted part of the ``surfels``' diffuse radiance, as ``camera`` sees them, that is not what their base
         color reflects under ``lighting``; of width 1. It has gradients in that radiance, base color and metallic alone: the light
         is what reflections say that it is."""
-        learned = "sh", "base_color", "metallic"
-        surfels = replace(
-            surfels, **{name: dr.detach(getattr(surfels, name)) for name in CHANNELS if name not in learned}
-        ).split()
+        held = {name: dr.detach(getattr(surfels, name)) for name in CHANNELS if name not in ("sh", "base_color", "metallic")}
+        surfels = replace(surfels, **held).split()
         lighting = lighting.with_learned([dr.detach(v) for v in lighting.learned()], surfels)
         center = surfels.column(mi.Point3f, "centers")
         view = dr.normalize(opaque(camera, len(surfels)).origin - center)

@@ -17,12 +17,10 @@ from ..shading import deferred
 from ..shading.lighting import Lighting, Shading, lighting_of
 from ..surfels.proxies import Proxies
 from ..surfels.surfels import CHANNELS, Surfels
-from . import losses, reflection_guided
+from . import light_maps, losses, reflection_guided
 from .cameras import Cameras
 from .curves import Curves
 from .density import DensityControl
-from .light_maps import STEPS as FILTERED_EVERY
-from .light_maps import LightMaps
 from .model import ENVIRONMENT, Model
 from .objective import CUTOFFS, Objective
 from .plan import LAST, LEAST_STEPS, STEPS
@@ -85,7 +83,7 @@ class Fit:
         self.proxies: Proxies | None = None
         self.irradiance_visibility: mi.Color3f | None = None
         self.emitter: mi.Emitter | None = None
-        self._light = LightMaps()
+        self._light = light_maps.LightMaps()
 
     # ---- State ----
 
@@ -227,7 +225,7 @@ class Fit:
         lighting = self.lighting(surfels, training=True)
         measured, reached = self._backward(views, surfels, lighting)
         if reached and (loss := self.objective.environment(self.model[ENVIRONMENT])) is not None:
-            dr.backward(loss * FILTERED_EVERY)
+            dr.backward(loss * light_maps.STEPS)
             measured.append({"loss.environment_tv": dr.detach(loss)})
         self.model.optimizer.step()
         if self.cameras:
@@ -279,17 +277,17 @@ class Fit:
             loss = self.objective.residual(surfels, lighting, self.dataset.train[views[0]].camera)
             dr.backward(loss)
             measured.append({"loss.residual": dr.detach(loss)})
-        light = len(CHANNELS) if lighting else -1
-        for k, (value, leaf) in enumerate(zip(shared, leaves)):
-            gradient = dr.grad(leaf)
-            gradient = dr.select(dr.isfinite(gradient), gradient, 0)  # one overflow must not end a fit
-            if k == light:
-                reached = self._light.gather(self.model, self.step_number, gradient)
-                continue
+        gradients = [dr.grad(leaf) for leaf in leaves]
+        gradients = [dr.select(dr.isfinite(g), g, 0) for g in gradients]  # one overflow must not end a fit
+        reached = False
+        if lighting:  # whose maps come first of what it learns
+            del shared[len(CHANNELS)]
+            reached = self._light.gather(self.model, self.step_number, gradients.pop(len(CHANNELS)))
+        for value, gradient in zip(shared, gradients):
             dr.set_grad(value, gradient)
             dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
-        return measured, lighting is not None and reached
+        return measured, reached
 
     def _view(self, i, surfels, lighting, weight):
         """Accumulate the gradients of view ``i``; returns its loss's terms and the mean squared ``error``."""

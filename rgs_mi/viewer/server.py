@@ -17,7 +17,7 @@ from ..core.runtime import HOST, PORT
 from .checks import same_origin
 from .frusta import Frusta
 from .look import Look, window_camera
-from .pace import GRIDS, Pace
+from .pace import Pace
 from .panel import Panel
 from .subject import Subject
 from .warm import draw, warm
@@ -146,9 +146,10 @@ class Server:
         if not self.pace.seconds:  # of a fit, what is compiled is no part of a picture's time
             due = [(number, window) for number, window in due if window.blank and not self.subject.changing]
             if not due:
-                self._warm(GRIDS[0])
+                self._warm()
                 return True
-        for number, window in due[:1]:
+        if due:
+            number, window = due[0]
             with contextlib.suppress(ValueError):  # it may leave meanwhile
                 self._turns.remove(number)
                 self._turns.append(number)
@@ -158,7 +159,7 @@ class Server:
             self._later.popleft()()
             return True
         if idle and self.pace.cold is not None:
-            self._warm(self.pace.cold)
+            self._warm()
             return True
         return False
 
@@ -177,8 +178,10 @@ class Server:
         if picture is not None and panel is not None:
             panel.show(picture)
 
-    def _warm(self, grid):
-        """Compile some of what a grid needs, and measure it after the last."""
+    def _warm(self):
+        """Compile some of what the smallest cold grid needs, and measure it after the last."""
+        grid = self.pace.cold
+        assert grid is not None, "there is one where this is called"
         self._warming = self._warming or warm(self.subject, grid)
         try:
             next(self._warming)

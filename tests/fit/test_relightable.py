@@ -116,8 +116,9 @@ def test_the_residual_and_its_gradient():
     step = np.where(facing[:, None], 3e-3 * np.sign(gradient), 0)
     difference = (loss(colors + step)[0] - loss(colors - step)[0]) / 2
     texels = lighting.estimator.environment.texels
-    dr.enable_grad(texels, surfels.centers, surfels.roughness)
+    held = texels, surfels.centers, surfels.rotations, surfels.roughness
+    dr.enable_grad(held)
     loss(colors)
-    assert not any(dr.grad(v).numpy().any() for v in (texels, surfels.centers, surfels.roughness))  # it moves no light
+    assert not any(dr.grad(v).numpy().any() for v in held)  # it moves no light
     assert value > 0.05 * weight and abs((gradient * step).sum() / difference - 1) < 0.03
     assert abs(gradient[facing]).max() > 0 and (gradient[(surfels.numpy()["centers"] @ camera.origin) < 0.9] == 0).all()
