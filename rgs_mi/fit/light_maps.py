@@ -4,12 +4,15 @@ from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from ..core.arrays import as_float
 from ..shading.environment import FilteredEnvironment
 from .model import ENVIRONMENT, Model
 
 #: Steps from one filtering to the next. An environment changes slowly, and filtering it is no work for threads.
 STEPS = 4
+_GATHERED = "light_gradient"  # its name in a checkpoint
 
 
 class LightMaps:
@@ -25,9 +28,20 @@ class LightMaps:
         environment, parameter = model.environment(), model[ENVIRONMENT]
         if self._of is None or self._of[1] != filtered or self._of[0].shape != parameter.shape:
             self._maps = environment.filtered() if filtered else environment.unfiltered()
-            self._of, self._gradient = (parameter, filtered), None
+            self._of = parameter, filtered
+            if self._gradient is not None and dr.width(self._gradient) != dr.width(self._maps.texels):
+                self._gradient = None  # in maps of another size
         assert self._maps is not None
         return replace(self._maps, environment=environment)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """For a checkpoint: what has been gathered, which `restore` takes back."""
+        return {} if self._gradient is None else {_GATHERED: self._gradient.numpy()}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Go on from the `state` among ``arrays``, of which the model's has been restored."""
+        self._maps, self._of = None, None
+        self._gradient = as_float(arrays[_GATHERED]) if _GATHERED in arrays else None
 
     def gather(self, model: Model, step: int, gradient: "mi.Float") -> bool:
         """Take the ``gradient`` of step number ``step`` in the maps that it has seen. The last of `STEPS` passes the sum on to

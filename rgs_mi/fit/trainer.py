@@ -88,13 +88,12 @@ class Fit:
     # ---- State ----
 
     def state(self) -> tuple[dict, dict]:
-        """(arrays, meta) for a checkpoint: with `resume` the fit goes on as if it had not been interrupted, but for gradients of
-        the environment that have not reached it yet (`LightMaps`)."""
+        """(arrays, meta) for a checkpoint: with `resume` the fit goes on as if it had not been interrupted."""
         gradients = self.density.gradients
         arrays = {"gradient_sum": gradients.sum.numpy(), "gradient_count": gradients.count.numpy()}
         meta = {"step": self.step_number, "views_used": self.views_used, "elapsed": self.elapsed, "extent": self.extent}
         meta["level"] = self._level and self._level.meta()
-        for learned in (self.cameras, self.turns):
+        for learned in (self.cameras, self.turns, self._light):
             arrays |= learned.state() if learned else {}
         return self.model.state() | arrays, meta | {"curves": self.curves.rows}
 
@@ -105,7 +104,7 @@ class Fit:
         fit.step_number, fit.views_used, fit.elapsed = int(meta["step"]), int(meta["views_used"]), float(meta["elapsed"])
         gradients = fit.density.gradients
         gradients.sum, gradients.count = (as_float(arrays[f"gradient_{k}"]) for k in ("sum", "count"))
-        for learned in (fit.cameras, fit.turns):
+        for learned in (fit.cameras, fit.turns, fit._light):
             if learned:
                 learned.restore(arrays)
         fit.curves = Curves(meta["curves"])

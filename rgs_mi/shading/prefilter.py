@@ -39,9 +39,10 @@ def _kernel_matrix(kernel_at, width, rows, columns, out_rows):
     theta = np.linspace(0, np.pi, fine)
     samples = columns * nodes
     delta = 2 * np.pi * np.arange(samples // 2 + 1) / samples  # the kernel is even in Δφ
-    # the lobe against its angle, dense where it is narrow
+    # the lobe against its angle, dense where it is narrow, and so against its cosine
     angles = np.pi / 2 * np.linspace(0, 1, 4096) ** 2
     table = kernel_at(angles)
+    cosines, values = np.cos(angles[::-1]), table[::-1]
     hat = np.maximum(0, 1 - np.abs(np.arange(fine)[:, None] / nodes - np.arange(rows)))  # [fine, rows]
     hat = (hat * np.sin(theta)[:, None]).astype(np.float32)
     theta_out = np.linspace(0, np.pi, out_rows)
@@ -51,7 +52,7 @@ def _kernel_matrix(kernel_at, width, rows, columns, out_rows):
     for i, t in enumerate(theta_out[: (out_rows + 1) // 2]):
         near = np.flatnonzero(np.abs(theta - t) <= reach)
         cosine = np.cos(t) * np.cos(theta[near, None]) + np.sin(t) * np.sin(theta[near, None]) * np.cos(delta)
-        kernel = np.interp(np.arccos(np.clip(cosine, -1, 1)).astype(np.float32), angles, table, right=0.0)
+        kernel = np.interp(cosine, cosines, values, left=0.0)
         spectrum = np.asarray(fft.dct(kernel.astype(np.float32), type=1, axis=1))  # cosine series: K is even in Δφ
         matrix[:, i] = (spectrum @ fold).T @ hat[near]
         matrix[:, out_rows - 1 - i] = matrix[:, i, ::-1]  # the southern hemisphere mirrors the northern
