@@ -53,7 +53,7 @@ from captures import (
     write_png16,
 )
 
-CASES, SECONDS, MEMORY, MORE = 200, 10, 2 << 30, 1 << 29
+CASES, SECONDS, MEMORY, MORE = 200, 5, 2 << 30, 1 << 29
 KEPT = Path(__file__).parents[1] / ".fuzz"
 OPENCV = (*FOCAL, *PRINCIPAL, -0.1, 0.02, 0.01, -0.01)
 

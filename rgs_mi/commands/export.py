@@ -14,7 +14,7 @@ from ..export import gltf_splat, splat_ply, usd_splat
 from ..export.bake import bake
 from ..export.mesh.surface import PACKAGES, packages
 from ..export.mitsuba_scene import SCENE
-from ..report.results import finished
+from ..report.results import finished, origin_of
 from ..shading.environment import Environment
 from .export_mesh import export_mesh
 
@@ -59,15 +59,16 @@ def export(
     folder = run / "export" / to if out is None else Path(out)
     make_folder(folder)
     scene = load_scene(path, {})
+    origin, y_up = origin_of(run), to_y_up(scene, path)
     if to == "mesh":
-        return export_mesh(run, path, scene, to_y_up(scene, path), folder, refine, data, quiet)
+        return export_mesh(run, path, scene, y_up, origin, folder, refine, data, quiet)
     splats = bake(scene, path, quiet)
     if to == "splat":
-        return splat_ply.write(folder, splats)
-    splats = splats.rotated(to_y_up(scene, path))
+        return splat_ply.write(folder, splats, origin.tolist())
+    splats, there = splats.rotated(y_up), (y_up @ origin).tolist()
     if to == "gltf-splat":
-        return gltf_splat.write(folder, splats)
-    return usd_splat.write(folder, splats, _texels(scene), kernel or usd_splat.KERNELS[0])
+        return gltf_splat.write(folder, splats, there)
+    return usd_splat.write(folder, splats, _texels(scene), kernel or usd_splat.KERNELS[0], there)
 
 
 def to_y_up(scene: "mi.Scene", path: str | Path) -> np.ndarray:

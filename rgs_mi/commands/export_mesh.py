@@ -23,13 +23,15 @@ def export_mesh(
     path: Path,
     scene: "mi.Scene",
     rotation: np.ndarray,
+    origin: np.ndarray,
     folder: Path,
     minutes: float | None = None,
     data: str | Path | None = None,
     quiet: bool = False,
 ) -> list[Path]:
     """Write the surfels of the ``scene``, which is that of the file ``path`` in the folder ``run``, as a mesh into ``folder``:
-    as a GLB, turned by ``rotation`` [3, 3], and as a scene of stock Mitsuba; return the paths of all files.
+    as a GLB, turned by ``rotation`` [3, 3] and put where the capture has the world's ``origin`` [3], and as a scene of stock
+    Mitsuba in the run's own world; return the paths of all files.
 
     The mesh is what the run's training cameras see; where the photographs are gone, what the scene's sensors see. With
     ``minutes`` textures and environment are refined that long against the training photographs, in the folder ``data`` (None:
@@ -61,7 +63,7 @@ def export_mesh(
         environment = found.pop("environment")
         result = replace(result, textures=replace(result.textures, **found))
         write()
-    return [*gltf.write(folder, result.mesh, result.texels, result.textures, rotation), *paths]
+    return [*gltf.write(folder, result.mesh, result.texels, result.textures, rotation, (rotation @ origin).tolist()), *paths]
 
 
 def _tell_what_is_lost(path, scene, lighting):

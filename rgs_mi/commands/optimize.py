@@ -149,8 +149,8 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
     opacity = begin.opacity or (_ANYWHERE if random else _ON_SURFACE)
     if settings.box is None and not any(view.masked for view in dataset.train):
         box = BoundingBox.seen_by([view.camera for view in dataset.train], None if random else points[0])
-        settings = replace(settings, box=(*box.min, *box.max))
-    box = _box(settings)
+        settings = replace(settings, box=box.moved(dataset.origin).corners)
+    box = _box(settings, dataset)
     if box is None:
         extent = float(np.linalg.norm(points[0] - points[0].mean(0), axis=1).max())
     else:
@@ -202,13 +202,14 @@ def _shading(scene, settings, dataset):
 
     Raises: UserError for a box that is none, and for cameras that see no turntable.
     """
-    return replace(scene.shading, box=_box(settings), turntable=light.turntable_of(settings, dataset))
+    return replace(scene.shading, box=_box(settings, dataset), turntable=light.turntable_of(settings, dataset))
 
 
-def _box(settings):
-    """The box around the object, or None. Raises: UserError for one that is none."""
+def _box(settings, dataset):
+    """The box around the object, or None. Settings have it in the world of the files, whose origin may be elsewhere. Raises:
+    UserError for one that is none."""
     try:
-        return None if settings.box is None else BoundingBox.of(settings.box)
+        return settings.box and BoundingBox.of(settings.box).moved(-np.array(dataset.origin))
     except ValueError as error:
         raise UserError(f"settings: box {settings.box}: {error}") from error
 

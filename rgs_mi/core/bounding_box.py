@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from .camera import Camera, focus_point
 
@@ -53,6 +54,15 @@ class BoundingBox:
         return cls.of([*lower, *upper])
 
     @property
+    def corners(self) -> tuple[float, float, float, float, float, float]:
+        """The six numbers that `of` takes."""
+        return (*self.min, *self.max)
+
+    def moved(self, shift: npt.ArrayLike) -> "BoundingBox":
+        """Return the box moved by ``shift`` [3]."""
+        return self.of((np.reshape(self.corners, (2, 3)) + shift).ravel())
+
+    @property
     def center(self) -> np.ndarray:
         """The middle of the box, [3]."""
         return (np.array(self.min) + self.max) / 2
@@ -71,5 +81,5 @@ class BoundingBox:
         return dr.all((point >= min) & (point <= max))
 
     def __str__(self) -> str:
-        """The six numbers that `of` takes."""
-        return " ".join(f"{v:.9g}" for v in (*self.min, *self.max))
+        """The `corners` as a scene file has them."""
+        return " ".join(f"{v:.9g}" for v in self.corners)

@@ -8,6 +8,7 @@ from ..core.errors import UserError
 from . import blender, colmap, llff, nerfstudio, nero
 from .resolution import LONGEST
 from .types import Dataset
+from .world_frame import recentred
 
 _LAYOUTS = blender, nerfstudio, colmap, llff, nero  # the first that fits is the one
 
@@ -15,9 +16,10 @@ _LAYOUTS = blender, nerfstudio, colmap, llff, nero  # the first that fits is the
 def load_dataset(root: str | Path, longest: int = LONGEST, quiet: bool = True) -> Dataset:
     """Load the capture in folder ``root``, in the first layout that it has: `blender`, `nerfstudio`, `colmap`, `llff`, `nero`.
 
-    World and cameras stay as in the files. Photographs of lenses with distortion are made those of pinholes
-    (`distortion.undistorted`, which keeps them). Those of more than ``longest`` pixels along a side are scaled to it, with
-    masks and cameras; unless ``quiet``, a line on stderr says how many.
+    World and cameras stay as in the files, but for a world whose origin is far away (`world_frame.recentred`). Photographs of
+    lenses with distortion are made those of pinholes (`distortion.undistorted`, which keeps them). Those of more than
+    ``longest`` pixels along a side are scaled to it, with masks and cameras. Unless ``quiet``, a line on stderr says how many,
+    and another where the origin is.
     Raises: UserError when the folder is missing, has no known layout, or when a file in it is bad.
     """
     root = Path(root)
@@ -26,9 +28,12 @@ def load_dataset(root: str | Path, longest: int = LONGEST, quiet: bool = True) -
     layout = _layout(root)
     if layout is None:
         raise UserError(f"data folder '{root}' has no layout that is known: looked for {looked_for()}")
-    dataset = layout.load(root, longest)
+    dataset = recentred(layout.load(root, longest))
     if not quiet:
         _tell_scaled(dataset, longest)
+        if any(dataset.origin):
+            words = ", ".join(f"{x:.9g}" for x in dataset.origin)
+            print(f"{root} is far from the origin of its world: that is moved to ({words})", file=sys.stderr)
     return dataset
 
 

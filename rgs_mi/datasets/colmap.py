@@ -53,7 +53,7 @@ def load(root: Path, longest: int = LONGEST) -> Dataset:
         )
     points, colors = sparse_points(root, [f"{model}/points3D{e}" for e in (".bin", ".txt", ".ply")]) or (None, None)
     return Dataset(
-        **load_split(source, frames, every_eighth(sorted(frame.name for frame in frames)), longest),
+        *load_split(source, frames, every_eighth(sorted(frame.name for frame in frames)), longest),
         points=points,
         point_colors=colors,
         root=root,

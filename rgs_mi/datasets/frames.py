@@ -98,7 +98,7 @@ def load_views(source: Path, frames: list[Frame], longest: int) -> list[View]:
     return kept
 
 
-def load_split(source: Path, frames: list[Frame], held_out: set[str], longest: int) -> dict[str, list[View]]:
+def load_split(source: Path, frames: list[Frame], held_out: set[str], longest: int) -> tuple[list[View], list[View]]:
     """Load views (`load_views`) as the lists ``train`` and ``test`` of `Dataset`; ``held_out`` are the names of test views.
 
     Raises: UserError where no view is left to train with.
@@ -107,7 +107,7 @@ def load_split(source: Path, frames: list[Frame], held_out: set[str], longest: i
     train = [view for view in views if view.name not in held_out]
     if not train:
         raise UserError(f"{source}: all {len(views)} usable views are held out as test views: add photographs")
-    return {"train": train, "test": [view for view in views if view.name in held_out]}
+    return train, [view for view in views if view.name in held_out]
 
 
 def every_eighth(names: list[str]) -> set[str]:

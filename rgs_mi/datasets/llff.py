@@ -11,6 +11,7 @@ sparse point cloud (`points.FILES`) may stand beside the poses, in the same worl
 import warnings
 from functools import partial
 from pathlib import Path
+from tokenize import TokenError
 
 import numpy as np
 
@@ -56,7 +57,7 @@ def load(root: Path, longest: int = LONGEST) -> Dataset:
         )
     points, colors = sparse_points(root) or (None, None)
     return Dataset(
-        **load_split(file, frames, every_eighth([frame.name for frame in frames]), longest),
+        *load_split(file, frames, every_eighth([frame.name for frame in frames]), longest),
         points=points,
         point_colors=colors,
         root=root,
@@ -73,7 +74,7 @@ def _read(file: Path) -> np.ndarray:
             raise ValueError(f"it holds {table.dtype} {list(table.shape)}, not numbers [N, {COLUMNS}]")
         with np.errstate(over="ignore", invalid="ignore"):
             return np.array(table, np.float64)
-    except (OSError, ValueError, OverflowError, MemoryError, SyntaxError, TypeError) as error:
+    except (OSError, ValueError, OverflowError, MemoryError, SyntaxError, TokenError, TypeError) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise UserError(f"{file} cannot be used as LLFF's poses ({reason}): export it again") from error
 

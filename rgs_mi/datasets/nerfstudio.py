@@ -51,7 +51,7 @@ def load(root: Path, longest: int = LONGEST) -> Dataset:
     kept, held_out = _split(file, meta, frames)
     points, colors = _points(file, meta) or (None, None)
     views = load_split(file, kept, held_out, longest)
-    return Dataset(**views, points=points, point_colors=colors, root=root, photographed=PHOTOGRAPHED)
+    return Dataset(*views, points=points, point_colors=colors, root=root, photographed=PHOTOGRAPHED)
 
 
 def _frame(file: Path, meta: dict, index: int, longest: int) -> Frame:

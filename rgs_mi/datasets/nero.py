@@ -46,7 +46,7 @@ def load(root: Path, longest: int = LONGEST) -> Dataset:
     frames = [_frame(file) for file in files]
     points, colors = sparse_points(root) or (None, None)
     return Dataset(
-        **load_split(root, frames, _held_out(root, [frame.name for frame in frames]), longest),
+        *load_split(root, frames, _held_out(root, [frame.name for frame in frames]), longest),
         points=points,
         point_colors=colors,
         root=root,

@@ -26,7 +26,7 @@ FILES = (
     "points3D.bin",
     "points3D.txt",
 )
-FARTHEST = 1e6  # as for cameras; a coordinate beyond is damage or an outlier that no photograph shows
+FARTHEST = 1e8  # as for cameras: earth-centred ones have 1e7. Beyond is damage, or an outlier that no photograph shows
 _COLMAP_POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")])
 _COLMAP_TRACK_ITEM = 8  # bytes: int32 image, int32 keypoint
 

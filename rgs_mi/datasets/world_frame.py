@@ -1,11 +1,16 @@
-"""The world of a reconstruction, which motion alone leaves open: where up is, where the middle is, and how long a unit."""
+"""The world of a capture: where up is, where the middle is, and how long a unit, which a reconstruction leaves open; and where
+its origin is, which single precision must not be far from."""
+
+from dataclasses import replace
 
 import numpy as np
 
 from ..core.alignment import Similarity
 from ..core.camera import Camera, focus_point
+from .types import Dataset
 
 DISTANCE = 4.0  # of the cameras from the origin, their median: as in NeRF Synthetic
+_FAR = 100  # distances of the cameras from what they look at: there single precision is a hundredth of a pixel
 _TRUST = 0.01  # in where a camera's own up points, against that its right is level
 
 
@@ -30,6 +35,30 @@ def world_frame(cameras: list[Camera]) -> Similarity:
     rotation = np.stack([x, np.cross(up, x), up])
     scale = DISTANCE / max(float(np.median(np.linalg.norm(away, axis=1))), 1e-9)
     return Similarity(scale, rotation, -scale * rotation @ center)
+
+
+def recentred(dataset: Dataset) -> Dataset:
+    """Return ``dataset`` in a world whose origin is near what the cameras look at and has a short name in the old one, a
+    multiple of a power of ten (`Dataset.origin`); the same where it is near already, as in most captures.
+
+    What comes after it is single precision: it has steps of a hundredth of the cameras' distance where that is a hundred
+    thousandth of the way to the origin.
+    """
+    center, distance = focus_point([view.camera for view in dataset.train])
+    if dataset.points is not None and len(dataset.points):  # cameras may all stand in one place
+        distance = max(distance, float(np.median(np.linalg.norm(dataset.points - center, axis=1))))
+    if np.linalg.norm(center) <= _FAR * distance:
+        return dataset
+    unit = 10.0 ** np.floor(np.log10(distance))
+    origin = np.round(center / unit) * unit
+    shift = Similarity(1.0, np.eye(3), -origin)
+
+    def moved(views):
+        return [replace(v, camera=replace(v.camera, to_world=shift.pose(v.camera.to_world))) for v in views]
+
+    points = None if dataset.points is None else dataset.points - origin
+    there = tuple((origin + dataset.origin).tolist())
+    return replace(dataset, train=moved(dataset.train), test=moved(dataset.test), points=points, origin=there)
 
 
 def _level(vector, up):

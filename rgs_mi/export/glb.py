@@ -2,7 +2,7 @@
 
 import json
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -42,15 +42,19 @@ class Buffer:
         self.accessors.append(accessor)
         return len(self.accessors) - 1
 
-    def document(self, primitive: dict, extensions: Iterable[str] = (), **properties: object) -> dict:
-        """Return the header of a file that shows one mesh of one ``primitive``, with further ``properties``."""
+    def document(
+        self, primitive: dict, extensions: Iterable[str] = (), origin: Sequence[float] = (0, 0, 0), **properties: object
+    ) -> dict:
+        """Return the header of a file that shows one mesh of one ``primitive``, whose own origin is at ``origin`` [3], with
+        further ``properties``."""
+        placed = {"translation": [*origin]} if any(origin) else {}
         used = sorted(extensions)
         return {
             "asset": {"version": "2.0", "generator": "rgs_mi"},
             **({"extensionsUsed": used} if used else {}),
             "scene": 0,
             "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0}],
+            "nodes": [{"mesh": 0, **placed}],
             "meshes": [{"primitives": [primitive]}],
             **properties,
             "accessors": self.accessors,

@@ -64,7 +64,7 @@ def told(settings: Settings, dataset: Dataset) -> str:
         "exposure": settings.exposure,
         "light": settings.light,
         "density.max_surfels": settings.density.max_surfels,
-    } | ({} if settings.box is None else {"box": "[" + ", ".join(f"{v:.3g}" for v in settings.box) + "]"})
+    } | ({} if settings.box is None else {"box": "[" + ", ".join(f"{v:.7g}" for v in settings.box) + "]"})
     return (
         f"{len(dataset.train)} {kind} of {width} x {height} pixels, {masks}, and {len(dataset.test)} held out: "
         + ", ".join(f"{name}={value}" for name, value in chosen.items())

@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from .. import __version__, report
+from ..core.errors import UserError
 from ..core.files import write_json, write_png
 from ..core.inputs import JSON, read_file
 from ..core.progress import Progress
@@ -190,6 +191,18 @@ def photographs_of(run: Path) -> tuple[str | None, int]:
     return (folder if isinstance(folder, str) else None), (longest if isinstance(longest, int) else LONGEST)
 
 
+def origin_of(run: Path) -> np.ndarray:
+    """Return where the origin of the ``run``'s world lies in that of its photographs' files (`Dataset.origin`), [3]; 0 where
+    metrics.json does not say, as in runs from before it did. Raises: UserError where what it says is no point."""
+    origin = (saved_figures(run) or {}).get("origin", (0, 0, 0))
+    try:
+        if np.isfinite(point := np.array(origin, float).reshape(3)).all():
+            return point
+    except (TypeError, ValueError):
+        pass
+    raise UserError(f"{run / METRICS}: its origin is no point: it is damaged")
+
+
 def digests(dataset: Dataset, settings: Settings) -> dict[str, str]:
     """Return what tells a fit from all others, as checkpoints and metrics.json have it: hashes of its photographs and of its
     settings."""
@@ -212,6 +225,7 @@ def _facts(fit) -> dict:
         "test_views": len(fit.dataset.test),
         "turntable": table and asdict(table),
         "room": room and {"center": room.center, "distances": dict(zip(SIDES, room.distances))},
+        "origin": fit.dataset.origin,
         "photographs": str(fit.dataset.root.resolve()),
         "settings": to_dict(fit.settings),
         "digests": digests(fit.dataset, fit.settings),

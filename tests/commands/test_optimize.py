@@ -1,6 +1,7 @@
 """The command line: what a run leaves behind, going on after a crash, and mistakes that cost one line each."""
 
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -11,11 +12,16 @@ import pytest
 from PIL import Image
 
 from rgs_mi import report
+from rgs_mi.commands.evaluate import reevaluate
+from rgs_mi.commands.export import export
+from rgs_mi.core.alignment import Similarity
 from rgs_mi.core.errors import UserError
 from rgs_mi.fit import checkpoint
 from rgs_mi.fit.scene import FitScene
 from rgs_mi.fit.trainer import Fit
+from rgs_mi.surfels.ply import read_ply
 
+from readers import glb_splats
 from runs import PATIENCE, ROOT, SMALL, assert_renders_as_written, start, start_script, wait_for
 
 SHOWN = ("psnr", "ssim", "lpips", "normal_mae_deg", "surfels", "iterations", "train_seconds", "render_fps", "peak_rss_mb")
@@ -142,6 +148,37 @@ def test_photographs_without_masks(inputs, tmp_path):
     assert 1 < scene.integrator().box.radius < 6
     assert np.linalg.norm(mi.traverse(scene)["object.centers"].numpy(), axis=1).max() > 10
     assert_renders_as_written(scene, tmp_path / "run")
+
+
+def test_a_world_that_is_far_from_its_origin(inputs, tmp_path):
+    """The run is in a world near by, and says where that is; boxes are given, and formats written, in the capture's."""
+    scene, data = inputs
+    shift = np.array([1e5, -2e5, 300.0])
+    shutil.copytree(data, tmp_path / "data")
+    for path in (tmp_path / "data").glob("transforms_*.json"):
+        meta = json.loads(path.read_text())
+        for frame in meta["frames"]:
+            frame["transform_matrix"] = Similarity(1.0, np.eye(3), shift).pose(np.array(frame["transform_matrix"])).tolist()
+        path.write_text(json.dumps(meta))
+    box = [*(shift - 2).tolist(), *(shift + 3).tolist()]
+    out = fit(scene, tmp_path / "data", tmp_path / "far", [*SMALL, f"box={box}"])
+    figures = metrics(out)
+    assert figures["origin"] == pytest.approx(shift, abs=3) and figures["settings"]["box"] == box
+    near = fit(scene, data, tmp_path / "near", [*SMALL, "box=[-2,-2,-2,3,3,3]"])
+    assert figures["psnr"] == pytest.approx(metrics(near)["psnr"], abs=0.3)
+    mean = lambda folder: read_ply(folder / "object.ply")["centers"].mean(0)
+    assert mean(out) + figures["origin"] - shift == pytest.approx(mean(near), abs=0.05)
+    reevaluate(out, quiet=True)
+    assert metrics(out)["psnr"] == pytest.approx(figures["psnr"], abs=1e-3)
+    (splats,) = export(out, "splat", quiet=True)
+    (origin,) = re.findall(rb"comment origin (.*)", splats.read_bytes())
+    assert [float(x) for x in origin.split()] == figures["origin"]
+    (glb,) = export(out, "gltf-splat", quiet=True)
+    x, y, z = figures["origin"]
+    assert glb_splats(glb)[1]["nodes"][0]["translation"] == pytest.approx([x, z, -y])
+    (out / "metrics.json").write_text((out / "metrics.json").read_text().replace('"origin": [', '"origin": ["a", '))
+    with pytest.raises(UserError, match="origin is no point"):
+        export(out, "splat", quiet=True)
 
 
 def test_render(run, tmp_path):

@@ -120,7 +120,7 @@ def refused(path, message):
 @pytest.mark.parametrize("name", ["points.ply", "points3D.bin", "points3D.txt"])
 def test_values_that_no_point_has(tmp_path, name):
     write = WRITERS[(tmp_path / name).suffix]
-    for bad in (np.nan, np.inf, -1e7):
+    for bad in (np.nan, np.inf, -1e9):
         refused(write(tmp_path / name, xyz=np.where(np.arange(12).reshape(4, 3) == 7, bad, XYZ)), "point 2 has a coordinate")
     refused(write(tmp_path / name, xyz=XYZ[:0]), "holds no points")
     (tmp_path / name).write_bytes(b"")

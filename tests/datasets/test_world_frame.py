@@ -1,12 +1,15 @@
 """The world of a reconstruction: up, middle and unit."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from rgs_mi.core.alignment import Similarity
 from rgs_mi.core.camera import Camera
-from rgs_mi.datasets.world_frame import DISTANCE, world_frame
+from rgs_mi.datasets.types import Dataset, View
+from rgs_mi.datasets.world_frame import DISTANCE, recentred, world_frame
 
 SCRAMBLE = Similarity(0.3, Rotation.from_rotvec([2.0, 0.3, -1.0]).as_matrix(), np.array([5.0, 2.0, -9.0]))
 
@@ -56,3 +59,40 @@ def test_straight_from_above():
     frame = world_frame([camera, Camera.look_at((0.5, 0, 3), (0, 0, 0), (0, 1, 0), 50, (80, 60))])
     assert np.isfinite(frame.rotation).all() and np.isfinite(frame.scale)
     np.testing.assert_allclose(frame.rotation @ frame.rotation.T, np.eye(3), atol=1e-12)
+
+
+# ---- Far from the origin ----
+
+
+def capture(cameras, points):
+    views = [
+        View(f"v{i}", camera, np.full((60, 80, 4), 255, np.uint8), False, None, Path()) for i, camera in enumerate(cameras)
+    ]
+    return Dataset(views[1:], views[:1], points=points)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+def test_a_world_that_is_far_away_is_moved_near(scale):
+    """By whole units, so that what is told can be typed; what is seen, and points, stay where they were."""
+    there = Similarity(scale, np.eye(3), scale * np.array([1e5, -3e6, 20.0]))
+    near, points = rings(range(0, 360, 30), (10, 40)), np.random.default_rng(0).normal(size=(20, 3))
+    far = capture([moved(camera, there) for camera in near], there.points(points))
+    found = recentred(far)
+    assert np.linalg.norm(found.points, axis=1).max() < 10 * scale and np.allclose(
+        found.origin, there.translation, atol=2 * scale
+    )
+    np.testing.assert_allclose(found.points + found.origin, far.points, rtol=1e-12)
+    units = np.array(found.origin) / (scale if scale != 1 else 1)
+    np.testing.assert_allclose(units, np.round(units), atol=1e-6)
+    for view, given in zip(found.train + found.test, far.train + far.test):
+        assert np.allclose(view.camera.origin + found.origin, given.camera.origin, rtol=1e-12) and view.name == given.name
+        seen, expected = (c.project(p)[0] for c, p in ((view.camera, found.points), (given.camera, far.points)))
+        np.testing.assert_allclose(seen, expected, atol=1e-4)
+    assert recentred(found) is found
+
+
+def test_a_world_that_is_near_stays():
+    cameras = [
+        moved(camera, Similarity(1.0, np.eye(3), np.array([100.0, 50, 0]))) for camera in rings(range(0, 360, 30), (10,))
+    ]
+    assert recentred(dataset := capture(cameras, None)) is dataset and dataset.origin == (0, 0, 0)

@@ -191,10 +191,10 @@ def test_gltf_shows_what_the_ply_shows(tmp_path):
 def test_usd(tmp_path, kernel):
     """OpenUSD reads the same, and finds nothing to complain about."""
     pytest.importorskip("pxr", reason="needs OpenUSD: pip install usd-core")
-    from pxr import Usd, UsdUtils, UsdValidation, UsdVol
+    from pxr import Usd, UsdGeom, UsdUtils, UsdValidation, UsdVol
 
     splats, light = random_splats(), np.random.default_rng(0).random((8, 16, 3), np.float32)
-    path, dome = usd_splat.write(tmp_path, splats.rotated(TURN), light, kernel)
+    path, dome = usd_splat.write(tmp_path, splats.rotated(TURN), light, kernel, (1e6, 2, -3))
     assert np.allclose(np.array(mi.Bitmap(str(dome))), light)
     stage = Usd.Stage.Open(str(path))
     prim = stage.GetPrimAtPath("/World/Splats")
@@ -207,6 +207,7 @@ def test_usd(tmp_path, kernel):
     flat = prim.HasAPI(UsdVol.ParticleFieldKernelGaussianSurfletAPI)
     solid = prim.HasAPI(UsdVol.ParticleFieldKernelGaussianEllipsoidAPI)
     assert (flat, solid) == (kernel == "surflet", kernel == "ellipsoid")
+    assert UsdGeom.Xformable(prim).GetLocalTransformation().ExtractTranslation() == (1e6, 2, -3)
     lowest, highest = of("extent")
     assert (lowest < of("positions").min(0)).all() and (highest > of("positions").max(0)).all()
     layers, assets, missing = UsdUtils.ComputeAllDependencies(str(path))

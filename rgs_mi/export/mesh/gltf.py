@@ -1,6 +1,7 @@
 """A textured mesh as glTF 2.0 with metallic-roughness material, in one GLB."""
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +18,17 @@ _LINEAR, _LINEAR_MIPMAP_LINEAR, _CLAMP = 9729, 9987, 33071
 _BRIGHT = 99.9  # percentile of the radiance that an emissive texture still holds
 
 
-def write(folder: str | Path, mesh: UVMesh, texels: Texels, textures: Textures, rotation: np.ndarray) -> list[Path]:
+def write(
+    folder: str | Path,
+    mesh: UVMesh,
+    texels: Texels,
+    textures: Textures,
+    rotation: np.ndarray,
+    origin: Sequence[float] = (0, 0, 0),
+) -> list[Path]:
     """Write the ``mesh`` with its ``textures`` as `NAME` into ``folder``, turned by ``rotation`` [3, 3] into a world whose y axis
-    points up, and return the path, in a list. glTF's α is roughness², as Mitsuba's is. What surfels radiate is emitted; where it
-    is brighter than white the extension `STRENGTH` scales it.
+    points up, in which a node puts its own origin at ``origin`` [3], and return the path, in a list. glTF's α is roughness²,
+    as Mitsuba's is. What surfels radiate is emitted; where it is brighter than white the extension `STRENGTH` scales it.
 
     Raises: UserError where the disk is full or the folder can't be written.
     """
@@ -59,6 +67,7 @@ def write(folder: str | Path, mesh: UVMesh, texels: Texels, textures: Textures, 
     document = buffer.document(
         primitive,
         extensions,
+        origin,
         materials=[material],
         textures=[{"source": k, "sampler": 0} for k in range(len(files))],
         images=files,
