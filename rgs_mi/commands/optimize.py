@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from ..export.mitsuba_scene import SCENE
 from ..fit import checkpoint, events, light
 from ..fit.model import Model
 from ..fit.plan import planned, told
+from ..fit.ranks import Ranks
 from ..fit.scene import FitScene
 from ..fit.trainer import Fit
 from ..priors import depth_priors
@@ -51,6 +53,7 @@ def optimize(
     quiet: bool = False,
     tensorboard: bool = False,
     window: tuple[str, int] | None = None,
+    ranks: Ranks = Ranks(),
 ) -> Path:
     """Fit the scene at ``path`` and write the run's folder, which is returned.
 
@@ -62,6 +65,7 @@ def optimize(
       resume:  go on from the newest checkpoint in ``out``
       tensorboard: write event files into the folder's ``tensorboard``
       window:  host and port of a page that shows the fit while it goes on (`viewer.live`)
+      ranks:   the processes that make the fit together, of which this is the first; the others call `join`
 
     Raises: UserError for bad input, a package that is missing, a folder that can't be written, and a fit that diverges;
     Stopped where someone has stopped it, by a signal or in the window, after everything is saved, and evaluated as well after
@@ -88,7 +92,9 @@ def optimize(
         log = events.Events(folder / "tensorboard", fit.step_number) if tensorboard else None
         watch = _watched(fit, folder, window)
         try:
-            stopped = _loop(fit, folder, quiet, log, watch)
+            fit.ranks = ranks
+            with ranks.sharing_cores():
+                stopped = _loop(fit, folder, quiet, log, watch)
         finally:
             for opened in filter(None, (log, watch)):
                 opened.close()
@@ -97,6 +103,23 @@ def optimize(
     if stopped:
         raise Stopped(stopped, f"stopped at {100 * fit.progress:.0f}%; go on with the same command and --resume")
     return folder
+
+
+def join(ranks: Ranks, path: str | Path, data: str | Path | None = None, variables: Mapping[str, str] | None = None) -> None:
+    """Make the steps of the fit that the first of ``ranks`` has begun with the same scene, until that ends it.
+
+    Raises: UserError for photographs that are not the same here, and where another process has ended too soon.
+    """
+    settings, arrays, meta = cast(tuple[Settings, dict, dict], ranks.same(None))
+    scene = FitScene.load(path, data, variables)
+    dataset = scene.dataset(settings.resolution, quiet=True)
+    if meta["digests"]["photographs"] != dataset.digest:
+        raise UserError(f"{dataset.root}: not the photographs of the first process: give all of them the same --data")
+    shading, priors = _shading(scene, settings, dataset), _priors(dataset, settings)
+    fit = Fit.resume(dataset, settings, arrays, meta, shading=shading, priors=priors, ranks=ranks)
+    with ranks.sharing_cores(), GracefulInterrupt(patient=True):  # a signal to all of them is the first one's to hear
+        while ranks.same(None):
+            fit.step()
 
 
 def _watched(fit, folder, window):
@@ -268,14 +291,17 @@ def _flat(tree, prefix="") -> dict:
 def _loop(fit, folder, quiet, events=None, watch=None) -> int | None:
     """Step until the budget is spent or someone stops it, also in a window (``watch``); returns None, or by which signal. Begins
     and ends with a checkpoint: a folder that can't be written is known before the work, not after it."""
-    settings, psnr = fit.settings, None
-    checkpoint.save(folder, *_state(fit, folder))
+    settings, psnr, ranks = fit.settings, None, fit.ranks
+    state = _state(fit, folder)
+    checkpoint.save(folder, *state)
+    ranks.same((settings, *state))  # for `join`
     if fit.progress < 1:
         (folder / results.METRICS).unlink(missing_ok=True)  # from here on the run is unfinished
     saved, paused = time.monotonic(), False
     planned = None if settings.iterations else max(0.0, 60 * settings.minutes - fit.elapsed)
-    with GracefulInterrupt() as interrupt, Progress(planned, quiet) as progress:
-        while fit.progress < 1 and interrupt.signal is None:
+    # torchrun passes Ctrl-C on, to processes that the terminal has told already
+    with GracefulInterrupt(patient=ranks.size > 1) as interrupt, Progress(planned, quiet) as progress:
+        while ranks.same(fit.progress < 1 and interrupt.signal is None):
             before = fit.elapsed
             recorded = fit.step()
             if not np.isfinite(fit.psnr):

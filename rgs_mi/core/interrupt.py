@@ -12,13 +12,17 @@ _MESSAGE = b"\nstopping after this step; press again to abort\n"
 
 
 class GracefulInterrupt:
-    """A context manager in which the first SIGINT, SIGTERM or SIGHUP is noted as ``signal``, and a second one raises `Stopped`.
+    """A context manager in which the first SIGINT, SIGTERM or SIGHUP is noted as ``signal``, and a second one raises `Stopped`,
+    unless it is ``patient``.
 
     The handlers that were there before return on exit; SIGHUP stays ignored where it was, below ``nohup``. Outside the main
     thread, where Python allows no handlers, it does nothing and ``signal`` stays None.
     """
 
     signal: int | None = None
+
+    def __init__(self, patient: bool = False) -> None:
+        self._patient = patient
 
     def __enter__(self) -> "GracefulInterrupt":
         main = threading.current_thread() is threading.main_thread()
@@ -32,9 +36,11 @@ class GracefulInterrupt:
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
     def _handle(self, number, frame):
-        if self.signal is not None:
+        again, self.signal = self.signal is not None, self.signal or number
+        if self._patient:
+            return
+        if again:
             raise Stopped(number)
-        self.signal = number
         try:
             os.write(2, _MESSAGE)  # not print(): a handler may run inside a print, whose buffer is not reentrant
         except OSError:

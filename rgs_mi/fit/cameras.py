@@ -53,6 +53,12 @@ class Rows:
             setattr(self, name, np.array(arrays[name]))
 
 
+def mean_rows(parts: Sequence[Mapping[int, np.ndarray]]) -> dict[int, np.ndarray]:
+    """Return the mean of gradients {row: [K]} that several processes have; what one of them does not have is zero there."""
+    rows = dict.fromkeys(row for part in parts for row in part)
+    return {row: np.sum([part[row] for part in parts if row in part], 0) / len(parts) for row in rows}
+
+
 @dataclass(frozen=True)
 class Seen:
     """How a step sees a view: through ``camera``, brightened by ``gain`` (None: as it is); ``prior`` is the loss of corrections
@@ -103,7 +109,7 @@ class Cameras:
 
     def see(self, view: int, camera: Camera, weights: Weights, started: bool = True) -> Seen:
         """Return how a step sees the ``view`` of this index through ``camera``, a window or another size of its own, with
-        gradients that the next `step` takes. Cameras are the given ones until they have ``started``."""
+        gradients for the next `step`. Cameras are the given ones until they have ``started``."""
         gain, prior = None, mi.Float(0)
         if POSES in self.rows and started:
             kind = self._kinds[_kind(self.given[view])]
@@ -123,9 +129,8 @@ class Cameras:
         self._leaves.append((name, row, leaf))
         return leaf
 
-    def step(self, rates: Mapping[str, float]) -> None:
-        """Move what the views seen since the last step have gradients for, at the ``rates`` of `POSES`, `LENSES` and
-        `EXPOSURE`; then take out some of what surfels and light can follow: a similarity of the world, and a gain of all."""
+    def gradients(self) -> dict[str, dict[int, np.ndarray]]:
+        """Return what the views seen since the last call have gradients for, {name: {row: [K]}}."""
         gradients: dict[str, dict[int, np.ndarray]] = {name: {} for name in self.rows}
         found = [[dr.grad(v) for v in leaf] for _, _, leaf in self._leaves]
         dr.eval(found)
@@ -133,6 +138,11 @@ class Cameras:
             gradient = np.array([float(v[0]) for v in leaf])
             gradients[name][row] = gradients[name].get(row, 0) + gradient
         self._leaves.clear()
+        return gradients
+
+    def step(self, gradients: Mapping[str, Mapping[int, np.ndarray]], rates: Mapping[str, float]) -> None:
+        """Move what has `gradients`, at the ``rates`` of `POSES`, `LENSES` and `EXPOSURE`; then take out some of what surfels and
+        light can follow: a similarity of the world, and a gain of all."""
         for name, rows in gradients.items():
             self.rows[name].step(rows, rates.get(name, 0.0), self._bases if name == POSES else None)
         if POSES in self.rows:

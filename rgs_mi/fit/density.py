@@ -9,6 +9,7 @@ from ..core.camera import Camera
 from ..settings.settings import Density
 from ..surfels.surfels import Surfels
 from .model import Model, logit
+from .ranks import Ranks
 from .reflection_guided import boxes, guided
 
 _SPLIT_SCALE = 1.6  # a split surfel's halves are that much smaller (3DGS)
@@ -28,6 +29,11 @@ class Gradients:
         length = dr.norm(mi.Vector2f(gradient.x * (size[0] / 2), gradient.y * (size[1] / 2)))
         self.sum += dr.select(seen & dr.isfinite(length), length, 0)
         self.count += dr.select(seen, mi.Float(1), 0)
+        dr.eval(self.sum, self.count)
+
+    def merge(self, sum: "mi.Float", count: "mi.Float") -> None:
+        """Add another's ``sum`` and ``count``, of the same surfels."""
+        self.sum, self.count = self.sum + sum, self.count + count
         dr.eval(self.sum, self.count)
 
     def mean(self) -> np.ndarray:
@@ -52,6 +58,11 @@ class DensityControl:
         [H, W] bool."""
         if self.settings.guided:
             self.reflective[view] = camera.baked(), boxes(mask)
+
+    def share(self, ranks: Ranks) -> None:
+        """Take over what other processes have noted."""
+        if self.settings.guided:
+            self.reflective = {view: noted for part in ranks.gather(self.reflective) for view, noted in part.items()}
 
     def guided(self, model: Model) -> np.ndarray | None:
         """Return [N] which surfels get half the threshold (RGS, Algorithm 1); None where nothing guides."""

@@ -18,12 +18,13 @@ from ..shading.lighting import Lighting, Shading, lighting_of
 from ..surfels.proxies import Proxies
 from ..surfels.surfels import CHANNELS, Surfels
 from . import light_maps, losses, reflection_guided
-from .cameras import Cameras
+from .cameras import Cameras, mean_rows
 from .curves import Curves
-from .density import DensityControl
+from .density import DensityControl, Gradients
 from .model import ENVIRONMENT, Model
 from .objective import CUTOFFS, Objective
 from .plan import LAST, LEAST_STEPS, STEPS
+from .ranks import Ranks
 from .schedule import Schedule
 from .turns import Turns
 
@@ -56,7 +57,8 @@ class Fit:
     ``extent``: radius of the object in world units. ``shading``: how the scene is shaded. ``priors``: a `DepthPrior` for
     each training view, or None. ``elapsed``: seconds spent so far, earlier sessions included; ``psnr``: of the last step's
     views, NaN once the fit has diverged; ``cameras``: what is learned of cameras and exposures, or None; ``turns``: what is
-    learned of a turntable's lamps, or None; ``curves``: what its steps measured.
+    learned of a turntable's lamps, or None; ``curves``: what its steps measured. ``ranks``: the processes that make the fit
+    together, all of which must call `step`; by default there is one.
     """
 
     def __init__(
@@ -67,7 +69,9 @@ class Fit:
         extent: float,
         shading: Shading = Shading(),
         priors: list[DepthPrior] | None = None,
+        ranks: Ranks = Ranks(),
     ) -> None:
+        self.ranks = ranks
         self.dataset, self.model, self.settings, self.extent, self.priors = dataset, model, settings, extent, priors
         self.schedule = Schedule.of(settings, shading)
         self.objective = Objective(settings, extent, shading.box)
@@ -99,7 +103,7 @@ class Fit:
 
     @classmethod
     def resume(cls, dataset: Dataset, settings: Settings, arrays: dict, meta: dict, **others) -> "Fit":
-        """The fit whose `state` this was. ``others``: ``shading``, ``priors``."""
+        """The fit whose `state` this was. ``others``: ``shading``, ``priors``, ``ranks``."""
         fit = cls(dataset, Model.from_state(arrays), settings, float(meta["extent"]), **others)
         fit.step_number, fit.views_used, fit.elapsed = int(meta["step"]), int(meta["views_used"]), float(meta["elapsed"])
         gradients = fit.density.gradients
@@ -218,7 +222,7 @@ class Fit:
             self.photographs = Photographs(self.dataset.train, stage.downscale, s.background, self.priors, s.mask_tolerance)
             release_memory()  # of arrays of sizes that do not come again
         self._follow_schedule()
-        views = self._next_views(stage.views)
+        views = self._next_views(stage.views * self.ranks.size)[self.ranks.rank :: self.ranks.size]
         surfels = self.model.surfels(self.sh_order)
         self._refresh(surfels)
         lighting = self.lighting(surfels, training=True)
@@ -227,16 +231,19 @@ class Fit:
             dr.backward(loss * light_maps.STEPS)
             measured.append({"loss.environment_tv": dr.detach(loss)})
         self.model.optimizer.step()
-        if self.cameras:
-            self.cameras.step(self.schedule.camera_rates(progress, stage.downscale * self.cameras.pixel))
-        if self.turns:
-            self.turns.step(self.schedule.turn_rate(progress))
         dr.eval(measured)
         mean = {name: np.mean([float(m[name][0]) for m in measured if name in m]) for m in measured for name in m}
-        self._judge(mean.pop("error"))
+        found = [learned.gradients() if learned else {} for learned in (self.cameras, self.turns)]
+        errors, cameras, turns = zip(*self.ranks.gather((mean.pop("error"), *found)))
+        if self.cameras:
+            gradients = {name: mean_rows([rows[name] for rows in cameras]) for name in self.cameras.rows}
+            self.cameras.step(gradients, self.schedule.camera_rates(progress, stage.downscale * self.cameras.pixel))
+        if self.turns:
+            self.turns.step(mean_rows(turns), self.schedule.turn_rate(progress))
+        self._judge(np.mean(errors))
         self.step_number += 1
         self._control_density()
-        seconds = time.monotonic() - start
+        seconds = self.ranks.same(time.monotonic() - start)
         self.elapsed += seconds
         self._level.note(seconds)
         state = {"step": self.step_number, "seconds": self.elapsed, "surfels": len(self.model), "pixels": pixels}
@@ -249,7 +256,8 @@ class Fit:
         while self.model[ENVIRONMENT].shape[0] < height:
             self.model.refine_environment()
         rates = self.schedule.learning_rates(optimizer.keys(), self.progress, self.extent, self.model.two_sided)
-        optimizer.set_learning_rate(rates)
+        longer = np.sqrt(self.ranks.size)  # what more views agree on has less noise (Adam: Malladi et al. 2022)
+        optimizer.set_learning_rate({name: longer * rate for name, rate in rates.items()})
 
     def _next_views(self, count):
         """Views of the next step: random orders of all, one after another, that depend on seed and position alone."""
@@ -271,13 +279,16 @@ class Fit:
         dr.enable_grad(leaves)
         surfels = Surfels(**dict(zip(CHANNELS, leaves)), two_sided=surfels.two_sided)
         lighting = lighting and lighting.with_learned(leaves[len(CHANNELS) :], surfels)
-        measured = [self._view(i, surfels, lighting, 1 / len(views)) for i in views]
+        statistics = Gradients(len(self.model))
+        measured = [self._view(i, surfels, lighting, 1 / len(views), statistics) for i in views]
         if lighting and self.schedule.explains(self.progress):
             loss = self.objective.residual(surfels, lighting, self.dataset.train[views[0]].camera)
             dr.backward(loss)
             measured.append({"loss.residual": dr.detach(loss)})
         gradients = [dr.grad(leaf) for leaf in leaves]
         gradients = [dr.select(dr.isfinite(g), g, 0) for g in gradients]  # one overflow must not end a fit
+        *gradients, lengths, counts = self.ranks.mean([*gradients, statistics.sum, statistics.count])
+        self.density.gradients.merge(lengths * self.ranks.size, counts * self.ranks.size)
         reached = False
         if lighting:  # whose maps come first of what it learns
             del shared[len(CHANNELS)]
@@ -288,8 +299,9 @@ class Fit:
         dr.traverse(dr.ADMode.Backward)
         return measured, reached
 
-    def _view(self, i, surfels, lighting, weight):
-        """Accumulate the gradients of view ``i``; returns its loss's terms and the mean squared ``error``."""
+    def _view(self, i, surfels, lighting, weight, statistics):
+        """Accumulate the gradients of view ``i``, and density control's ``statistics``; returns its loss's terms and the mean
+        squared ``error``."""
         assert self.photographs is not None
         photo, gain, terms = self.photographs.tile(i, self.views_used // len(self.dataset.train) + i), None, {}
         if self.cameras:
@@ -306,7 +318,7 @@ class Fit:
         terms |= loss.terms
         dr.backward(sum(terms.values()) * weight)
         gradient = dr.grad(means2d_offset) * (photo.part / weight)  # as if all of the window had been seen
-        self.density.gradients.add(gradient, image.gbuffer.seen, photo.size)
+        statistics.add(gradient, image.gbuffer.seen, photo.size)
         if loss.reflective is not None:
             self.density.note_reflective(i, photo.camera, loss.reflective)
         return dr.detach(terms) | {"error": loss.error}
@@ -325,6 +337,7 @@ class Fit:
             return
         if (budget := self.schedule.surfel_budget(self.progress)) is not None:
             self.proxies = None
+        self.density.share(self.ranks)
         self.density.refine(self.model, np.random.default_rng((self.settings.seed, self.step_number)), budget)
 
     # ---- Pictures ----

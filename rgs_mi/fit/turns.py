@@ -26,8 +26,8 @@ class Turns:
         return cls(table) if table is not None and len(table.rings) > 1 else None
 
     def see(self, camera: Camera) -> "mi.Float | None":
-        """Return the turn of the lamps in radians when ``camera`` sees the object, with a gradient that the next `step` takes;
-        None for the lowest ring, whose turn is the given one."""
+        """Return the turn of the lamps in radians when ``camera`` sees the object, with a gradient for the next `step`; None
+        for the lowest ring, whose turn is the given one."""
         if not (ring := self.given.ring(camera)):
             return None
         turn = dr.opaque(mi.Float, np.radians(self.given.rings[ring][1]) + float(self.rows.value[ring, 0]))
@@ -35,12 +35,16 @@ class Turns:
         self._leaves.append((ring, turn))
         return turn
 
-    def step(self, rate: float) -> None:
-        """Move the rings that were seen since the last step, at this ``rate``."""
+    def gradients(self) -> dict[int, np.ndarray]:
+        """Return those of the rings that were seen since the last call, {ring: [1]}."""
         gradients: dict[int, np.ndarray] = {}
         for ring, turn in self._leaves:
             gradients[ring] = gradients.get(ring, np.zeros(1)) + float(dr.grad(turn)[0])
         self._leaves.clear()
+        return gradients
+
+    def step(self, gradients: Mapping[int, np.ndarray], rate: float) -> None:
+        """Move the rings that have `gradients`, at this ``rate``."""
         self.rows.step(gradients, rate)
 
     @property

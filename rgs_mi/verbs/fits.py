@@ -43,22 +43,28 @@ def optimize(parser: Parser) -> Run:
         scene, data = find_scene(args.scene, "scenes"), args.data and find_scene(args.data, "targets")
         check_settings(args)
         set_variant(args.variant)
-        from ..commands.optimize import optimize
+        from ..commands.optimize import join, optimize
+        from ..fit.ranks import restarted, started
 
-        optimize(
-            scene,
-            data=data,
-            variables=parse_variables(args.define),
-            config=args.config,
-            overrides=args.overrides,
-            minutes=args.minutes,
-            seed=args.seed,
-            out=args.out,
-            resume=args.resume,
-            quiet=args.quiet,
-            tensorboard=args.tensorboard,
-            window=(args.host, args.port) if args.view else None,
-        )
+        variables = parse_variables(args.define)
+        with started() as ranks:
+            if ranks.rank:
+                return join(ranks, scene, data, variables)
+            optimize(
+                scene,
+                data=data,
+                variables=variables,
+                config=args.config,
+                overrides=args.overrides,
+                minutes=args.minutes,
+                seed=args.seed,
+                out=args.out,
+                resume=args.resume or restarted(),
+                quiet=args.quiet,
+                tensorboard=args.tensorboard,
+                window=(args.host, args.port) if args.view else None,
+                ranks=ranks,
+            )
 
     return run
 

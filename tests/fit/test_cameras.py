@@ -197,7 +197,7 @@ def test_poses_and_exposures_come_back():
             image = deferred.render(surfels, s.camera, lighting)
             shown = losses.display(image.color * s.gain, image.gbuffer.all.alpha, 1.0)
             dr.backward(losses.photometric(shown, photo.color, s.camera.size, 0.2) + s.prior)
-            cameras.step({POSES: rate, LENSES: 0.0, EXPOSURE: 10 * rate})
+            cameras.step(cameras.gradients(), {POSES: rate, LENSES: 0.0, EXPOSURE: 10 * rate})
     after = pose_errors([cameras.camera(k) for k in range(6)], truth)
     assert np.median(before[0]) > 0.8 and np.median(after[0]) < 0.35, (before, after)
     assert np.median(after[1]) < 0.4 * np.median(before[1])
@@ -213,14 +213,14 @@ def test_gauge(dataset):
         s = cameras.see(view, dataset.train[view].camera, SETTINGS.weights)
         pulled = [*s.camera.learned.numbers().origin, *s.gain]
         dr.backward(sum(v * float(w) for v, w in zip(pulled, rng.normal(size=6))) + s.prior)
-        cameras.step({POSES: 1e-2, LENSES: 1e-3, EXPOSURE: 1e-2})
+        cameras.step(cameras.gradients(), {POSES: 1e-2, LENSES: 1e-3, EXPOSURE: 1e-2})
     assert np.abs(cameras.rows[POSES].value).max() > 3e-3 and np.abs(cameras.rows[EXPOSURE].value).max() > 3e-3
     poses, gains = (cameras.rows[name].value for name in (POSES, EXPOSURE))
     drift = lambda: np.abs(cameras._modes.T @ poses.ravel()).max() + np.abs(gains.mean(0)).max()
     others = lambda: poses.ravel() - cameras._modes @ (cameras._modes.T @ poses.ravel())
     before, kept = drift(), others()
     for _ in range(200):
-        cameras.step({})
+        cameras.step({}, {})
     assert drift() < 0.03 * before and before > 1e-3 and np.allclose(others(), kept)
 
 

@@ -94,9 +94,9 @@ def test_tiles_of_a_large_window_estimate_it(dataset, monkeypatch):
     color = np.array(whole.color).T.reshape(height, width, 3)
 
     def measured():
-        fit.density = type(fit.density)(settings.density, 1.0, None, len(fit.model))
-        loss = fit._view(view, fit.model.surfels(0), None, 1.0)
-        return float(loss["loss.photometric"][0]), float(loss["error"][0]), fit.density.gradients.sum.numpy()
+        statistics = Gradients(len(fit.model))
+        loss = fit._view(view, fit.model.surfels(0), None, 1.0, statistics)
+        return float(loss["loss.photometric"][0]), float(loss["error"][0]), statistics.sum.numpy()
 
     expected = measured()
     monkeypatch.setattr("rgs_mi.datasets.photographs.MOST_PIXELS", width * height // 3)

@@ -1,0 +1,134 @@
+"""Several processes that make one fit, on one machine or many: each renders its share of a step's views (data parallel).
+
+``torchrun`` starts them. Each has the whole model and moves it in the same way: gradients are averaged over all in one
+all-reduce, random numbers have the same seeds, and what a clock or a signal decides, the first process decides for all.
+"""
+# pyright: reportPrivateImportUsage=false
+# PyTorch exports its stores under a private name alone.
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from datetime import timedelta
+from typing import Any, TypeVar
+
+import drjit as dr
+import mitsuba as mi
+
+from ..core.errors import UserError
+from ..core.runtime import cores
+
+T = TypeVar("T")
+_PATIENCE = timedelta(days=1)  # of processes that wait for one that evaluates, or that a person has paused
+
+
+class Ranks:
+    """The processes of a fit: this one is number ``rank`` of ``size``. By default it is alone, and collects its own.
+
+    All must call the same methods in the same order. Raises, from each: UserError where another process has ended.
+    """
+
+    def __init__(self, rank: int = 0, size: int = 1, here: int = 1) -> None:
+        self.rank, self.size = rank, size
+        self._here = here  # processes of this machine
+
+    @contextmanager
+    def sharing_cores(self) -> Iterator[None]:
+        """Take only this process's part of the machine's cores until the block ends."""
+        before = dr.thread_count()
+        try:
+            if self._here > 1:
+                dr.set_thread_count(max(1, cores() // self._here))
+            yield
+        finally:
+            if self._here > 1:
+                dr.set_thread_count(before)  # `set_variant` says why one is too few for results
+
+    def mean(self, arrays: Sequence[Any]) -> list[Any]:
+        """Return the mean over all processes of each of ``arrays``, Dr.Jit's, flat ones of floats or tensors, whose shapes are
+        the same everywhere; they travel as one."""
+        if self.size == 1:
+            return list(arrays)
+        import torch.distributed
+
+        flat = [a.array if dr.is_tensor_v(a) else a for a in arrays]
+        together: Any = dr.concat(flat)
+        dr.eval(together)
+        with _together(self):
+            torch.distributed.all_reduce(shared := together.torch())
+        together, means, first = mi.Float(shared) / self.size, [], 0
+        for array, part in zip(arrays, flat):
+            own = dr.gather(mi.Float, together, first + dr.arange(mi.UInt32, dr.width(part)))
+            means.append(type(array)(own, array.shape) if dr.is_tensor_v(array) else own)
+            first += dr.width(part)
+        dr.eval(means)
+        return means
+
+    def gather(self, value: T) -> list[T]:
+        """Return what each process gives as ``value``, in their order; anything that can be pickled."""
+        if self.size == 1:
+            return [value]
+        import torch.distributed
+
+        values: list[Any] = [None] * self.size
+        with _together(self):
+            torch.distributed.all_gather_object(values, value)
+        return values
+
+    def same(self, value: T) -> T:
+        """Return the first process's ``value`` in all; anything that can be pickled."""
+        if self.size == 1:
+            return value
+        import torch.distributed
+
+        values = [value]
+        with _together(self):
+            torch.distributed.broadcast_object_list(values, src=0)
+        return values[0]
+
+
+@contextmanager
+def started() -> Iterator[Ranks]:
+    """The processes that torchrun has started this one with, until the block ends. Raises: UserError where PyTorch is missing."""
+    rank, size, here = (int(os.environ.get(name, default)) for name, default in _OF_TORCHRUN)
+    if size == 1:
+        yield Ranks()
+        return
+    try:
+        from torch import distributed
+        from torch.distributed.rendezvous import rendezvous
+    except ImportError as error:
+        raise UserError("several processes need PyTorch: pip install 'rgs-mi[distributed]'") from error
+    backend = "nccl" if mi.variant() and mi.variant().startswith("cuda") else "gloo"
+    store, rank, size = next(rendezvous("env://"))
+    store = distributed.PrefixStore(f"start {_starts()}", store)  # which still has the addresses of those before a restart
+    distributed.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=_PATIENCE)
+    try:
+        yield Ranks(rank, size, here)
+    finally:
+        distributed.destroy_process_group()
+
+
+_OF_TORCHRUN = ("RANK", "0"), ("WORLD_SIZE", "1"), ("LOCAL_WORLD_SIZE", "1")
+
+
+def restarted() -> bool:
+    """Return whether torchrun has started this process again, after one of them ended too soon."""
+    return _starts() > 0
+
+
+def _starts():
+    """How often torchrun has started all processes again."""
+    return int(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"))
+
+
+@contextmanager
+def _together(ranks):
+    """What PyTorch says of a process that is gone, as a line."""
+    try:
+        yield
+    except RuntimeError as error:
+        raise UserError(
+            f"process {ranks.rank + 1} of {ranks.size}: another one of this fit has ended: with --max-restarts torchrun starts "
+            "all again from the last checkpoint"
+        ) from error
