@@ -24,14 +24,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from PIL import ExifTags, Image
 
 import rgs_mi
+from rgs_mi.core.caches import cached_arrays
 from rgs_mi.core.errors import UserError
-from rgs_mi.datasets import load_dataset
+from rgs_mi.core.scene_files import load_scene
+from rgs_mi.datasets import exif, load_dataset
 from rgs_mi.fit import checkpoint
 from rgs_mi.fit.curves import Curves
 from rgs_mi.priors import files as depth_files
-from rgs_mi.report import results
+from rgs_mi.report import cameras, results
 from rgs_mi.settings.config import load_config, to_dict
 from rgs_mi.settings.settings import Settings
 from rgs_mi.shading.shader import Shader, initial_weights
@@ -55,6 +58,17 @@ from captures import (
 
 CASES, SECONDS, MEMORY, MORE = 200, 5, 2 << 30, 1 << 29
 KEPT = Path(__file__).parents[1] / ".fuzz"
+SCENE = """<scene version="3.0.0">
+    <default name="spp" value="4"/>
+    <integrator type="rgs_deferred"> <string name="diffuse" value="radiance"/> </integrator>
+    <sensor type="perspective" id="one"> <float name="fov" value="40"/>
+        <transform name="to_world"> <lookat origin="0, -4, 1" target="0, 0, 0" up="0, 0, 1"/> </transform>
+        <film type="hdrfilm"> <integer name="width" value="30"/> <integer name="height" value="24"/> <rfilter type="box"/> </film>
+        <sampler type="independent"> <integer name="sample_count" value="$spp"/> </sampler> </sensor>
+    <shape type="surfels" id="object"> <string name="filename" value="object.ply"/> </shape>
+    <emitter type="envmap"> <string name="filename" value="light.exr"/>
+        <transform name="to_world"> <matrix value="1 0 0 0 0 0 -1 0 0 1 0 0 0 0 0 1"/> </transform> </emitter>
+</scene>"""
 OPENCV = (*FOCAL, *PRINCIPAL, -0.1, 0.02, 0.01, -0.01)
 
 
@@ -103,6 +117,12 @@ def write_all(root: Path) -> list:
     for name in images:
         save(llff / f"masks/{name}.png", mask)
 
+    jpeg = write_llff(folder("jpeg"), images, scale=1 / 4, suffix=".jpg")
+    for path in jpeg.glob("images/*.jpg"):  # as cameras write them, with an exposure
+        exif = Image.Exif()
+        exif.get_ifd(ExifTags.IFD.Exif).update({ExifTags.Base.ExposureTime: 0.01, ExifTags.Base.FNumber: 2.5})
+        Image.open(path).save(path, exif=exif)
+
     rng = np.random.default_rng(0)
     surfels = {
         "centers": rng.normal(size=(5, 3)),
@@ -135,10 +155,24 @@ def write_all(root: Path) -> list:
     write_exr(maps / "d2.exr", np.dstack([depth] * 3))
     write_png16(maps / "d3.png", 1000 * depth)
 
+    scene = folder("scene")
+    write_ply(scene / "object.ply", surfels)
+    write_exr(scene / "light.exr", np.full((8, 16, 3), 0.5, np.float32))
+    (scene / "scene.xml").write_text(SCENE)
+
+    cached = {"values": rng.normal(size=(20, 3)).astype(np.float32)}
+    cached_arrays(root / "cache.npz", lambda arrays: None, lambda: cached)
+
+    row = {"size": [30, 24], "focal": FOCAL, "principal": PRINCIPAL, "gain": [1.0, 1.1, 0.9]}
+    row |= {"given": np.eye(4).tolist(), "to_world": np.eye(4).tolist()}
+    row |= {"distortion": {"k1": 0.1, "k2": 0.0, "p1": 0.0, "p2": 0.0, "reach": 1.5}}
+    learned = {"learned": {"poses": True, "exposure": True}, "train": {v.name: row for v in views}}
+    (folder("learned") / cameras.FILE).write_text(json.dumps(learned))
+
     inside = lambda path: sorted(file for file in path.rglob("*") if file.is_file())
     targets = [
         (lambda path=path: check_dataset(load_dataset(path)), inside(path))
-        for path in (blender, studio, binary, text, nero, nero_text, llff)
+        for path in (blender, studio, binary, text, nero, nero_text, llff, jpeg)
     ]
     return targets + [
         (lambda: check_finite(read_ply(root / "surfels.ply").values()), [root / "surfels.ply"]),
@@ -146,12 +180,16 @@ def write_all(root: Path) -> list:
         (lambda: check_depths(depth_files.load(views, maps)), inside(maps)),
         (lambda: load_config(Settings, [root / "settings.yaml"]), [root / "settings.yaml"]),
         (lambda: check_finite([Shader.load(root / "shader.npz").weights.numpy()]), [root / "shader.npz"]),
+        (lambda: check_scene(load_scene(scene / "scene.xml", {})), inside(scene)),
+        (lambda: check_cache(cached_arrays(root / "cache.npz", check_cache, lambda: cached)), [root / "cache.npz"]),
+        (lambda: check_cameras(cameras.read_training(root / "learned", views)), [root / "learned" / cameras.FILE]),
         (lambda: (results.saved_figures(run), Curves.read(run)), [run / "metrics.json", run / "curves.csv"]),
     ]
 
 
 def check_dataset(data):
     assert data.train
+    check_finite([exif.log_gains([view.path for view in data.train])])
     for view in data.train + data.test:
         camera = view.camera
         assert view.pixels.shape == (*camera.size[::-1], 4) and view.pixels[..., 3].any()
@@ -160,6 +198,23 @@ def check_dataset(data):
         assert view.normal is None or view.normal.shape == (*view.pixels.shape[:2], 3)
     if data.points is not None:
         check_finite([data.points])
+
+
+def check_scene(scene):
+    import mitsuba as mi
+
+    params = mi.traverse(scene)
+    check_finite([np.array(params[name]) for name in params.keys() if "data" in name or name.endswith("centers")])
+
+
+def check_cache(arrays):
+    assert arrays["values"].shape == (20, 3)
+    check_finite(arrays.values())
+
+
+def check_cameras(found):
+    for seen in (found or {}).values():  # None: there is no such file
+        check_finite([seen.camera.to_world, seen.camera.focal, seen.camera.principal, seen.gain])
 
 
 def check_finite(arrays):
