@@ -1,26 +1,34 @@
 """What holds for any input, of which hypothesis thinks up some and keeps, in .hypothesis, those that failed: settings, surfels,
-checkpoints, cameras and names come back as they went in, or are refused in a line."""
+checkpoints, cameras and names come back as they went in, or are refused in a line; starts go with the world."""
 
 import math
 import os
 import struct
 import tempfile
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
+from rgs_mi.core.alignment import Similarity
 from rgs_mi.core.errors import UserError
 from rgs_mi.core.telling import one_line
 from rgs_mi.datasets.colmap_files import CAMERA_MODELS, read_model
 from rgs_mi.datasets.resolution import chosen
 from rgs_mi.datasets.transforms import find_image
+from rgs_mi.datasets.types import Dataset
+from rgs_mi.datasets.world_frame import recentred
 from rgs_mi.export.mitsuba_scene import sensor_ids
 from rgs_mi.fit import checkpoint
+from rgs_mi.priors.initialization import initial_points
 from rgs_mi.settings.config import load_config, to_dict
 from rgs_mi.settings.fields import walk
 from rgs_mi.settings.settings import Settings
@@ -233,3 +241,28 @@ def test_any_message_is_a_line(text):
     line = str(UserError(text))
     line.encode()
     assert len(line.splitlines()) <= 1 and line.isprintable()
+
+
+# ---- Worlds ----
+
+REAL = st.floats(-1, 1)
+VECTORS = st.tuples(REAL, REAL, REAL).map(np.array)
+
+
+@settings(SHORT, max_examples=15)
+@given(VECTORS, VECTORS, st.floats(-3, 6))
+def test_starts_go_with_the_world(dataset, turn, shift, magnitude):
+    """A capture that is turned, moved and scaled has its first surfels where they were, but for the hull's grid, whose axes
+    are the world's."""
+    scale = 10**magnitude
+    world = Similarity(scale, Rotation.from_rotvec(3 * turn).as_matrix(), 1e5 * scale * shift)
+    views = [replace(v, camera=replace(v.camera, to_world=world.pose(v.camera.to_world))) for v in dataset.train]
+    there = recentred(Dataset(views, []))
+    expected, normals, colors, spacing = initial_points(dataset, 2000, compare=False)
+    found = initial_points(there, 2000, compare=False)
+    assert np.median(found[3]) == pytest.approx(scale * np.median(spacing), rel=0.1)
+    back = (found[0] + there.origin - world.translation) @ world.rotation / scale
+    away, nearest = KDTree(back).query(expected)
+    assert np.quantile(away, 0.98) < 4 * np.median(spacing)
+    facing = (normals * (found[1] @ world.rotation)[nearest]).sum(1)
+    assert np.median(facing) > 0.97 and np.median(np.abs(colors - found[2][nearest])) < 0.02

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 
 from .errors import UserError
 from .inputs import is_file
@@ -46,7 +47,9 @@ def load_scene(path: str | Path, variables: Mapping[str, object]) -> "mi.Scene":
     try:
         # In parallel, surfels that wait for Dr.Jit may take over the reading of an EXR, whose own tasks wait for a thread that
         # waits for Python, to make another of our plugins: for ever.
-        return mi.load_file(str(path), parallel=False, **{name: str(value) for name, value in variables.items()})
+        scene = mi.load_file(str(path), parallel=False, **{name: str(value) for name, value in variables.items()})
+        _check_light(scene.environment())
+        return scene
     except UserError:
         raise
     except Exception as error:  # Mitsuba wraps what a plugin raises, its traceback included
@@ -55,6 +58,13 @@ def load_scene(path: str | Path, variables: Mapping[str, object]) -> "mi.Scene":
             text = text.rpartition("UserError: ")[2]
         text = " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\] ", "", text).split())
         raise UserError(f"cannot load {path}: {text}") from error
+
+
+def _check_light(emitter: "mi.Emitter | None") -> None:
+    """What Mitsuba does not look at. Raises: ValueError for an ``emitter`` whose map has numbers that are not finite."""
+    if emitter is not None and emitter.class_name() == "EnvironmentMapEmitter":
+        if not np.isfinite(mi.traverse(emitter)["data"].numpy()).all():
+            raise ValueError("its environment map holds NaN or infinity: export it again")
 
 
 def _check_no_code(path):

@@ -29,7 +29,7 @@ def sample_surface(
     chosen = np.concatenate([rng.permutation(kept), rng.permutation(rest)])[:count]
 
     normal = (weights[chosen] * normals[faces[face[chosen]]]).sum(1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(normal.dtype).tiny)
     return positions[chosen].astype(np.float32), normal.astype(np.float32)
 
 
@@ -38,7 +38,7 @@ def _bend(faces, normals, area):
     corners = normals[faces].astype(np.float64)
     change = np.linalg.norm(corners - corners.mean(1, keepdims=True), axis=2).max(1)
     total = np.bincount(faces.ravel(), np.repeat(change * np.sqrt(area / 2), 3))  # of change over √(2 area), times the area
-    return (total / np.maximum(np.bincount(faces.ravel(), np.repeat(area, 3)), 1e-12))[faces].mean(1)
+    return (total / np.maximum(np.bincount(faces.ravel(), np.repeat(area, 3)), np.finfo(float).tiny))[faces].mean(1)
 
 
 def thinned(positions: np.ndarray, radius: np.ndarray) -> np.ndarray:

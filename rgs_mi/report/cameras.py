@@ -95,14 +95,23 @@ def _read(folder, kind, views):
         rows = {}
         for view in views:
             row = saved[kind][view.name]
-            lens = Lens(**{name: float(value) for name, value in row["distortion"].items()})
-            (fx, fy), (cx, cy), (width, height) = row["focal"], row["principal"], row["size"]
-            of = lambda key: Camera(np.array(row[key], float).reshape(4, 4), (fx, fy), (cx, cy), (width, height), lens)
-            gain = np.array(row["gain"], float).reshape(3) if exposure else None
+            lens = Lens(**dict(zip(row["distortion"], _numbers([*row["distortion"].values()]))))
+            (fx, fy), (cx, cy) = map(_numbers, (row["focal"], row["principal"]))
+            width, height = map(int, row["size"])
+            of = lambda key: Camera(np.reshape(_numbers(row[key]), (4, 4)), (fx, fy), (cx, cy), (width, height), lens)
+            gain = np.reshape(_numbers(row["gain"]), 3) if exposure else None
             rows[view.name] = of("given"), Registered(of("to_world"), gain)
         return poses, exposure, rows
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise UserError(f"{path}: damaged, or not of these photographs ({error}): fit again") from error
+
+
+def _numbers(value) -> list[float]:
+    """What JSON has as a list, or a list of lists, of finite numbers. Raises: ValueError, TypeError."""
+    numbers = np.array(value, float).ravel()
+    if not np.isfinite(numbers).all():
+        raise ValueError("a number is not finite")
+    return numbers.tolist()
 
 
 # ---- Figures ----
