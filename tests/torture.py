@@ -155,14 +155,14 @@ def kill(root, number, undisturbed, by=signal.SIGKILL):
         process.send_signal(by)
         asked = time.monotonic()
         try:
-            process.communicate(timeout=PATIENCE)
+            _, error = process.communicate(timeout=PATIENCE)
         except subprocess.TimeoutExpired:
             process.kill()
             raise Lost("it does not end") from None
         waited = time.monotonic() - asked
         if by == signal.SIGTERM:
             # before Python has its handlers, the signal itself ends the process
-            hold(process.returncode in (0, 143, -by), f"it ended with {process.returncode}")
+            hold(process.returncode in (0, 143, -by), f"it ended with {process.returncode}: {error}")
             undisturbed["longest"] = max(undisturbed.get("longest", 0), waited)
     run.finish("--resume")
     hold(abs(run.psnr() - undisturbed["psnr"]) < TOLERANCE, f"{run.psnr():.2f} dB instead of {undisturbed['psnr']:.2f}")

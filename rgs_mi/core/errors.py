@@ -51,19 +51,18 @@ def run_main(main: Callable[[], int | str | None]) -> NoReturn:
         warnings.showwarning = _print_warning
         try:
             sys.exit(main())
-        except UserError as error:
-            print(f"error: {error}", file=sys.stderr)
-            sys.exit(2)
-        except MemoryError as error:
-            print(f"error: out of memory ({one_line(error)}): use fewer or smaller photographs", file=sys.stderr)
-            sys.exit(2)
-        except (KeyboardInterrupt, RuntimeError) as error:
-            stop = _stop_behind(error)
-            if stop is None:
-                raise
-            stopped = stop if isinstance(stop, Stopped) else Stopped(signal.SIGINT)
-            print(stopped, file=sys.stderr)
-            sys.exit(stopped.code)
+        except (KeyboardInterrupt, Exception) as error:
+            if stop := _stop_behind(error):
+                stopped = stop if isinstance(stop, Stopped) else Stopped(signal.SIGINT)
+                print(stopped, file=sys.stderr)
+                sys.exit(stopped.code)
+            if isinstance(error, UserError):
+                print(f"error: {error}", file=sys.stderr)
+                sys.exit(2)
+            if isinstance(error, MemoryError):
+                print(f"error: out of memory ({one_line(error)}): use fewer or smaller photographs", file=sys.stderr)
+                sys.exit(2)
+            raise
 
 
 @contextmanager
@@ -83,8 +82,8 @@ def _terminable():
 
 
 def _stop_behind(error):
-    """The KeyboardInterrupt that ``error`` is, or was caused by: what comes while Dr.Jit calls Python it wraps. None if there is
-    none."""
+    """The KeyboardInterrupt that ``error`` is, or was caused by: one that comes while C++ calls Python, in Dr.Jit or as Mitsuba is
+    imported, is wrapped in whatever they have. None if there is none."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__
     return error

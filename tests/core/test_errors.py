@@ -72,3 +72,16 @@ def test_out_of_memory_is_a_line(capsys):
         2,
         "error: out of memory (Unable to allocate 9 GiB): use fewer or smaller photographs\n",
     )
+
+
+@pytest.mark.parametrize("wrapped", [SystemError("a result with an exception set"), UserError("the variant does not run")])
+def test_signals_that_were_wrapped_have_their_codes(wrapped, capsys):
+    """As when they come while Mitsuba is imported, which then is said to be missing."""
+
+    def main():
+        try:
+            raise Stopped(signal.SIGTERM)
+        except Stopped as stop:
+            raise wrapped from stop
+
+    assert outcome(main, capsys) == (143, "interrupted\n")
