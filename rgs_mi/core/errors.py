@@ -82,8 +82,8 @@ def _terminable():
 
 
 def _stop_behind(error):
-    """The KeyboardInterrupt that ``error`` is, or was caused by: one that comes while C++ calls Python, in Dr.Jit or as Mitsuba is
-    imported, is wrapped in whatever they have. None if there is none."""
+    """The KeyboardInterrupt that ``error`` is, or was caused by: one that comes while C++ calls Python, in Dr.Jit or as Mitsuba
+    is imported, is wrapped in whatever they have. None if there is none."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__
     return error
