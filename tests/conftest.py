@@ -1,3 +1,4 @@
+import os
 import signal
 
 import pytest
@@ -12,11 +13,13 @@ from runs import end_all, make_inputs
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
+VARIANT = os.environ.get("RGS_MI_VARIANT", "llvm_ad_rgb")
+
 
 @pytest.fixture(autouse=True)
 def variant():
     """Every test runs in the variant that the package is for; a test that changes it is put right again."""
-    rgs_mi.set_variant("llvm_ad_rgb")
+    rgs_mi.set_variant(VARIANT)
 
 
 @pytest.fixture(autouse=True)
@@ -29,12 +32,12 @@ def processes():
 @pytest.fixture(scope="session")
 def inputs(tmp_path_factory):
     """(scene to fit, its photographs) of `runs.make_inputs`, which no test changes."""
-    rgs_mi.set_variant()
+    rgs_mi.set_variant(VARIANT)
     return make_inputs(tmp_path_factory.mktemp("inputs"))
 
 
 @pytest.fixture(scope="session")
 def dataset():
     """`fits.random_photographs`, which no test changes."""
-    rgs_mi.set_variant()
+    rgs_mi.set_variant(VARIANT)
     return random_photographs()

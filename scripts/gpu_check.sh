@@ -1,0 +1,38 @@
+#!/usr/bin/env bash
+# What the package does on a GPU, in eight minutes and one table:
+#
+#     scripts/gpu_check.sh [OUT]        (default: runs/gpu_check)
+#
+# Installs the clone, from the folder `wheels` where there is one, which needs no network (`pip download -c constraints.txt -d wheels
+# '.[test]' setuptools wheel` fills it), runs the tests of kernels, both benchmarks and two minutes of the helmet in
+# `cuda_ad_rgb`, or in the variant that RGS_MI_VARIANT names, and ends with 1 where one of them fails. OUT has what they print.
+set -uo pipefail
+cd "$(dirname "$0")/.."
+export RGS_MI_VARIANT=${RGS_MI_VARIANT:-cuda_ad_rgb}
+out=${1:-runs/gpu_check}
+mkdir -p "$out"
+rows=()
+
+# stage NAME SECONDS PATTERN COMMAND…: the last line of its output that matches goes into the table
+stage() {
+    local name=$1 most=$2 pattern=$3 start=$SECONDS state=ok
+    shift 3
+    echo "== $name" >&2
+    timeout "$most" "$@" >"$out/$name.log" 2>&1 || state="failed ($?)"
+    [ "$state" = ok ] || tail -n 5 "$out/$name.log" >&2
+    rows+=("$(printf '%-8s  %-12s %4d s  %s' "$name" "$state" $((SECONDS - start)) "$(grep -aE "$pattern" "$out/$name.log" | tail -n 1)")")
+}
+
+offline=""
+[ -d wheels ] && offline="--no-index --find-links wheels"
+venv=$out/venv
+stage install 150 . bash -c "python3 -m venv '$venv' && '$venv'/bin/pip install --quiet $offline -c constraints.txt -e '.[test]'"
+nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv,noheader 2>/dev/null
+stage tests 180 'passed|failed' "$venv"/bin/pytest -q -x tests/splat tests/shading/test_split_sum.py tests/fit/test_losses.py \
+    tests/fit/test_density.py tests/fit/test_trainer.py
+stage splat 60 'backward' "$venv"/bin/python scripts/benchmark.py splat --variant "$RGS_MI_VARIANT"
+stage step 90 'ms' "$venv"/bin/python scripts/benchmark.py step --data ball --variant "$RGS_MI_VARIANT"
+stage helmet 300 '^PSNR' "$venv"/bin/python scripts/optimize.py scenes/helmet.xml --minutes 2 --out "$out/helmet" --variant "$RGS_MI_VARIANT" --quiet
+
+printf '%s\n' "" "${rows[@]}"
+! printf '%s\n' "${rows[@]}" | grep -q failed
