@@ -58,7 +58,7 @@ class Ranks:
             torch.distributed.all_reduce(shared := together.torch())
         together, means, first = mi.Float(shared) / self.size, [], 0
         for array, part in zip(arrays, flat):
-            own = dr.gather(mi.Float, together, first + dr.arange(mi.UInt32, dr.width(part)))
+            own = dr.gather(mi.Float, together, dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, dr.width(part)))
             means.append(type(array)(own, array.shape) if dr.is_tensor_v(array) else own)
             first += dr.width(part)
         dr.eval(means)
