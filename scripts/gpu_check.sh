@@ -30,8 +30,8 @@ stage install 150 . bash -c "python3 -m venv '$venv' && '$venv'/bin/pip install 
 nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv,noheader 2>/dev/null
 stage tests 180 'passed|failed' "$venv"/bin/pytest -q -x tests/splat tests/shading/test_split_sum.py tests/fit/test_losses.py \
     tests/fit/test_density.py tests/fit/test_trainer.py
-stage splat 60 'backward' "$venv"/bin/python scripts/benchmark.py splat --variant "$RGS_MI_VARIANT"
-stage step 90 'ms' "$venv"/bin/python scripts/benchmark.py step --data ball --variant "$RGS_MI_VARIANT"
+stage splat 60 '^total' "$venv"/bin/python scripts/benchmark.py splat --variant "$RGS_MI_VARIANT"
+stage step 90 'ms a step' "$venv"/bin/python scripts/benchmark.py step --data ball --variant "$RGS_MI_VARIANT"
 stage helmet 300 '^PSNR' "$venv"/bin/python scripts/optimize.py scenes/helmet.xml --minutes 2 --out "$out/helmet" --variant "$RGS_MI_VARIANT" --quiet
 
 printf '%s\n' "" "${rows[@]}"
