@@ -94,7 +94,12 @@ def _real(folder: Path) -> Path:
 def _acquire(path: Path, wait: bool) -> int | None:
     """The descriptor of the lock file, locked, in a folder that is made where need be; None where there are no locks."""
     while True:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except FileExistsError:
+            if os.path.lexists(path.parent) and not path.parent.is_dir():
+                raise
+            continue  # its owner has just removed the folder, which was empty
         if not fcntl:
             return None
         try:

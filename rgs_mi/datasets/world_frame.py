@@ -11,6 +11,7 @@ from .types import Dataset
 
 DISTANCE = 4.0  # of the cameras from the origin, their median: as in NeRF Synthetic
 _FAR = 100  # distances of the cameras from what they look at: there single precision is a hundredth of a pixel
+_NOWHERE = 1e-9  # of the way to the origin: cameras that are all in one place do not say how far away anything is
 _TRUST = 0.01  # in where a camera's own up points, against that its right is level
 
 
@@ -39,15 +40,19 @@ def world_frame(cameras: list[Camera]) -> Similarity:
 
 def recentred(dataset: Dataset) -> Dataset:
     """Return ``dataset`` in a world whose origin is near what the cameras look at and has a short name in the old one, a
-    multiple of a power of ten (`Dataset.origin`); the same where it is near already, as in most captures.
+    multiple of a power of ten (`Dataset.origin`); the same where it is near already, as in most captures, or where nothing
+    tells a distance, as with a single camera.
 
     What comes after it is single precision: it has steps of a hundredth of the cameras' distance where that is a hundred
     thousandth of the way to the origin.
     """
-    center, distance = focus_point([view.camera for view in dataset.train])
-    if dataset.points is not None and len(dataset.points):  # cameras may all stand in one place
+    cameras = [view.camera for view in (*dataset.train, *dataset.test)]
+    center, _ = focus_point(cameras)
+    distance = max(float(np.linalg.norm(camera.origin - center)) for camera in cameras)
+    if dataset.points is not None and len(dataset.points):
         distance = max(distance, float(np.median(np.linalg.norm(dataset.points - center, axis=1))))
-    if np.linalg.norm(center) <= _FAR * distance:
+    away = float(np.linalg.norm(center))
+    if not _NOWHERE * away < distance < away / _FAR:
         return dataset
     unit = 10.0 ** np.floor(np.log10(distance))
     origin = np.round(center / unit) * unit

@@ -96,3 +96,7 @@ def test_a_world_that_is_near_stays():
         moved(camera, Similarity(1.0, np.eye(3), np.array([100.0, 50, 0]))) for camera in rings(range(0, 360, 30), (10,))
     ]
     assert recentred(dataset := capture(cameras, None)) is dataset and dataset.origin == (0, 0, 0)
+
+
+def test_one_camera_tells_no_distance():
+    assert recentred(dataset := capture(rings([30], (10,)) * 2, None)) is dataset
