@@ -2,6 +2,7 @@
 
 import difflib
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import mitsuba as mi
@@ -62,13 +63,13 @@ def export(
     origin, y_up = origin_of(run), to_y_up(scene, path)
     if to == "mesh":
         return export_mesh(run, path, scene, y_up, origin, folder, refine, data, quiet)
-    splats = bake(scene, path, quiet)
+    splats = replace(bake(scene, path, quiet), origin=origin)
     if to == "splat":
-        return splat_ply.write(folder, splats, origin.tolist())
-    splats, there = splats.rotated(y_up), (y_up @ origin).tolist()
+        return splat_ply.write(folder, splats)
+    splats = splats.rotated(y_up)
     if to == "gltf-splat":
-        return gltf_splat.write(folder, splats, there)
-    return usd_splat.write(folder, splats, _texels(scene), kernel or usd_splat.KERNELS[0], there)
+        return gltf_splat.write(folder, splats)
+    return usd_splat.write(folder, splats, _texels(scene), kernel or usd_splat.KERNELS[0])
 
 
 def to_y_up(scene: "mi.Scene", path: str | Path) -> np.ndarray:

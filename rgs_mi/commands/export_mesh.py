@@ -23,7 +23,7 @@ def export_mesh(
     path: Path,
     scene: "mi.Scene",
     rotation: np.ndarray,
-    origin: np.ndarray,
+    origin: tuple[float, float, float],
     folder: Path,
     minutes: float | None = None,
     data: str | Path | None = None,

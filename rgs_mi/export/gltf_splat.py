@@ -1,6 +1,5 @@
 """Splats as glTF: one GLB with the extension KHR_gaussian_splatting (Khronos 2026)."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +13,10 @@ EXTENSION = "KHR_gaussian_splatting"
 _POINTS = 0
 
 
-def write(folder: str | Path, splats: Splats, origin: Sequence[float] = (0, 0, 0)) -> list[Path]:
+def write(folder: str | Path, splats: Splats) -> list[Path]:
     """Write ``splats``, in a world whose y axis points up, as `NAME` into ``folder`` and return the path, in a list: floats
     throughout, linear scales and opacities, quaternions (x, y, z, w), coefficients of display sRGB. Who does not know the
-    extension sees points of the mean colour. A node puts their own origin at ``origin`` [3].
+    extension sees points of the mean colour. A node puts them where their origin is.
 
     Raises: UserError where the disk is full or the folder can't be written.
     """
@@ -29,7 +28,7 @@ def write(folder: str | Path, splats: Splats, origin: Sequence[float] = (0, 0, 0
         "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
     }
     path = Path(folder) / NAME
-    buffer.write(path, buffer.document(primitive, [EXTENSION], origin))
+    buffer.write(path, buffer.document(primitive, [EXTENSION], splats.origin))
     return [path]
 
 

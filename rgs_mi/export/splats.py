@@ -26,6 +26,7 @@ class Splats:
     scales     [N, 2], standard deviations along the first two axes
     opacities  [N], in (0, 1)
     harmonics  [N, 16, 3], the h_k of the module, of display sRGB
+    origin     (x, y, z), where the origin of their world lies in that of the capture (`Dataset.origin`)
     """
 
     centers: np.ndarray
@@ -33,6 +34,7 @@ class Splats:
     scales: np.ndarray
     opacities: np.ndarray
     harmonics: np.ndarray
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def __len__(self) -> int:
         return len(self.centers)
@@ -50,11 +52,13 @@ class Splats:
         """Return the same splats in a world that ``rotation`` [3, 3] takes this one to."""
         turn = Rotation.from_matrix(rotation)
         as_float = lambda values: np.ascontiguousarray(values, np.float32)
+        x, y, z = map(float, rotation @ self.origin)
         return replace(
             self,
             centers=as_float(turn.apply(self.centers)),
             rotations=as_float((turn * Rotation.from_quat(self.rotations)).as_quat()),
             harmonics=as_float(np.einsum("jk,nkc->njc", sh_rotation(rotation), self.harmonics)),
+            origin=(x, y, z),
         )
 
 

@@ -3,7 +3,6 @@
 # OpenUSD's modules fill themselves when they are imported.
 
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,19 +28,15 @@ def check() -> None:
 
 
 def write(
-    folder: str | Path,
-    splats: Splats,
-    environment: np.ndarray | None = None,
-    kernel: str = "ellipsoid",
-    origin: Sequence[float] = (0, 0, 0),
+    folder: str | Path, splats: Splats, environment: np.ndarray | None = None, kernel: str = "ellipsoid"
 ) -> list[Path]:
     """Write ``splats`` and the ``environment`` that they were baked under (latitude-longitude, [rows, columns, 3], linear
     radiance; None: none), both in a world whose y axis points up, as `NAME` and `DOME` into ``folder``; return the paths.
 
     ``kernel`` 'ellipsoid' makes them a ``ParticleField3DGaussianSplat``, which readers of splats know; 'surflet' a
     ``ParticleField`` of flat Gaussians, which is what surfels are. Longitudes of the map are those of a dome light without
-    turning it: both have their middle column in +z, and +x a quarter of the width to its left. ``origin`` [3] is where that of
-    the splats is put.
+    turning it: both have their middle column in +z, and +x a quarter of the width to its left. Splats are put where
+    their origin is.
 
     Raises: UserError where OpenUSD is missing, the disk is full or the folder can't be written.
     """
@@ -57,8 +52,8 @@ def write(
         root = UsdGeom.Xform.Define(stage, "/World")
         stage.SetDefaultPrim(root.GetPrim())
         _field(stage, "/World/Splats", splats, kernel)
-        if any(origin):
-            UsdGeom.Xformable(stage.GetPrimAtPath("/World/Splats")).AddTranslateOp().Set(tuple(origin))
+        if any(splats.origin):
+            UsdGeom.Xformable(stage.GetPrimAtPath("/World/Splats")).AddTranslateOp().Set(splats.origin)
         if environment is not None:
             write_exr(path.with_name(DOME), environment)
             dome = UsdLux.DomeLight.Define(stage, "/World/Environment")

@@ -90,8 +90,7 @@ class Ranks:
 @contextmanager
 def started() -> Iterator[Ranks]:
     """The processes that torchrun has started this one with, until the block ends. Raises: UserError where PyTorch is missing."""
-    rank, size, here = (int(os.environ.get(name, default)) for name, default in _OF_TORCHRUN)
-    if size == 1:
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield Ranks()
         return
     try:
@@ -104,12 +103,9 @@ def started() -> Iterator[Ranks]:
     store = distributed.PrefixStore(f"start {_starts()}", store)  # which still has the addresses of those before a restart
     distributed.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=_PATIENCE)
     try:
-        yield Ranks(rank, size, here)
+        yield Ranks(rank, size, int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
     finally:
         distributed.destroy_process_group()
-
-
-_OF_TORCHRUN = ("RANK", "0"), ("WORLD_SIZE", "1"), ("LOCAL_WORLD_SIZE", "1")
 
 
 def restarted() -> bool:

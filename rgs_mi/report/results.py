@@ -191,13 +191,14 @@ def photographs_of(run: Path) -> tuple[str | None, int]:
     return (folder if isinstance(folder, str) else None), (longest if isinstance(longest, int) else LONGEST)
 
 
-def origin_of(run: Path) -> np.ndarray:
-    """Return where the origin of the ``run``'s world lies in that of its photographs' files (`Dataset.origin`), [3]; 0 where
+def origin_of(run: Path) -> tuple[float, float, float]:
+    """Return where the origin of the ``run``'s world lies in that of its photographs' files (`Dataset.origin`); 0 where
     metrics.json does not say, as in runs from before it did. Raises: UserError where what it says is no point."""
     origin = (saved_figures(run) or {}).get("origin", (0, 0, 0))
     try:
-        if np.isfinite(point := np.array(origin, float).reshape(3)).all():
-            return point
+        x, y, z = map(float, origin)
+        if np.isfinite((x, y, z)).all():
+            return x, y, z
     except (TypeError, ValueError):
         pass
     raise UserError(f"{run / METRICS}: its origin is no point: it is damaged")

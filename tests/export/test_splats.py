@@ -1,5 +1,7 @@
 """Baked splats: what they look like, and that PLY, glTF and USD say the same of them, read by code that is not ours."""
 
+from dataclasses import replace
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -194,7 +196,7 @@ def test_usd(tmp_path, kernel):
     from pxr import Usd, UsdGeom, UsdUtils, UsdValidation, UsdVol
 
     splats, light = random_splats(), np.random.default_rng(0).random((8, 16, 3), np.float32)
-    path, dome = usd_splat.write(tmp_path, splats.rotated(TURN), light, kernel, (1e6, 2, -3))
+    path, dome = usd_splat.write(tmp_path, replace(splats.rotated(TURN), origin=(1e6, 2.0, -3.0)), light, kernel)
     assert np.allclose(np.array(mi.Bitmap(str(dome))), light)
     stage = Usd.Stage.Open(str(path))
     prim = stage.GetPrimAtPath("/World/Splats")
