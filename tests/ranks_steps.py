@@ -12,7 +12,7 @@ from rgs_mi.settings.settings import Density
 
 from fits import SETTINGS, model, random_photographs
 
-STEPS = 9
+STEPS = 8  # after which no gradient of the light waits, which each process has its own of (`LightMaps`)
 GROWING = Density(start=0.0, stop=1.0, refine_every=4, grow_grad2d=1e-5, max_surfels=400)
 LEARNED = replace(SETTINGS, cameras="learned", exposure="learned", cameras_start=0.0, density=GROWING)
 

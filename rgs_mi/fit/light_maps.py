@@ -35,7 +35,7 @@ class LightMaps:
         return replace(self._maps, environment=environment)
 
     def state(self) -> dict[str, np.ndarray]:
-        """For a checkpoint: what has been gathered, which `restore` takes back."""
+        """For a checkpoint: what has been gathered, which `restore` takes back; of several processes by the one that saves."""
         return {} if self._gradient is None else {_GATHERED: self._gradient.numpy()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -43,19 +43,22 @@ class LightMaps:
         self._maps, self._of = None, None
         self._gradient = as_float(arrays[_GATHERED]) if _GATHERED in arrays else None
 
-    def gather(self, model: Model, step: int, gradient: "mi.Float") -> bool:
-        """Take the ``gradient`` of step number ``step`` in the maps that it has seen. The last of `STEPS` passes the sum on to
-        the ``model``'s environment, which is filtered again for the next; returns whether it did."""
+    def gather(self, step: int, gradient: "mi.Float") -> "mi.Float | None":
+        """Take the ``gradient`` of step number ``step`` in the maps that it has seen. The last of `STEPS` returns the sum, which
+        `pass_on` is to take."""
+        gradient = gradient if self._gradient is None else self._gradient + gradient
+        self._gradient = None if (step + 1) % STEPS == 0 else gradient
+        dr.eval(self._gradient)
+        return gradient if self._gradient is None else None
+
+    def pass_on(self, model: Model, gradient: "mi.Float") -> None:
+        """Pass ``gradient``, in the maps that were seen, on to the ``model``'s environment, which is filtered again for the next
+        step."""
         assert self._maps is not None and self._of is not None, "see() comes first"
-        self._gradient = gradient if self._gradient is None else self._gradient + gradient
-        if (step + 1) % STEPS:
-            dr.eval(self._gradient)
-            return False
-        dr.set_grad(self._maps.texels, self._gradient)
+        dr.set_grad(self._maps.texels, gradient)
         dr.enqueue(dr.ADMode.Backward, self._maps.texels)
         dr.traverse(dr.ADMode.Backward)
         parameter = model[ENVIRONMENT]
         if parameter.array.index_ad != self._of[0].array.index_ad:
             dr.accum_grad(parameter, dr.grad(self._of[0]))
-        self._maps = self._of = self._gradient = None
-        return True
+        self._maps = self._of = None

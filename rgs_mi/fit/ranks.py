@@ -46,21 +46,25 @@ class Ranks:
 
     def mean(self, arrays: Sequence[Any]) -> list[Any]:
         """Return the mean over all processes of each of ``arrays``, Dr.Jit's, flat ones of floats or tensors, whose shapes are
-        the same everywhere; they travel as one."""
+        the same everywhere; they travel as one. Those that are None stay None."""
         if self.size == 1:
             return list(arrays)
         import torch.distributed
 
-        flat = [a.array if dr.is_tensor_v(a) else a for a in arrays]
+        flat = [a.array if dr.is_tensor_v(a) else a for a in arrays if a is not None]
         together: Any = dr.concat(flat)
         dr.eval(together)
         with _together(self):
             torch.distributed.all_reduce(shared := together.torch())
         together, means, first = mi.Float(shared) / self.size, [], 0
-        for array, part in zip(arrays, flat):
-            own = dr.gather(mi.Float, together, dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, dr.width(part)))
+        for array in arrays:
+            if array is None:
+                means.append(None)
+                continue
+            width = dr.width(array.array if dr.is_tensor_v(array) else array)
+            own = dr.gather(mi.Float, together, dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, width))
             means.append(type(array)(own, array.shape) if dr.is_tensor_v(array) else own)
-            first += dr.width(part)
+            first += width
         dr.eval(means)
         return means
 

@@ -233,14 +233,13 @@ class Fit:
         self.model.optimizer.step()
         dr.eval(measured)
         mean = {name: np.mean([float(m[name][0]) for m in measured if name in m]) for m in measured for name in m}
-        found = [learned.gradients() if learned else {} for learned in (self.cameras, self.turns)]
-        errors, cameras, turns = zip(*self.ranks.gather((mean.pop("error"), *found)))
+        self._judge(mean.pop("error"))
         if self.cameras:
-            gradients = {name: mean_rows([rows[name] for rows in cameras]) for name in self.cameras.rows}
+            found = self.ranks.gather(self.cameras.gradients())
+            gradients = {name: mean_rows([rows[name] for rows in found]) for name in self.cameras.rows}
             self.cameras.step(gradients, self.schedule.camera_rates(progress, stage.downscale * self.cameras.pixel))
         if self.turns:
-            self.turns.step(mean_rows(turns), self.schedule.turn_rate(progress))
-        self._judge(np.mean(errors))
+            self.turns.step(mean_rows(self.ranks.gather(self.turns.gradients())), self.schedule.turn_rate(progress))
         self.step_number += 1
         self._control_density()
         seconds = self.ranks.same(time.monotonic() - start)
@@ -270,8 +269,8 @@ class Fit:
         return chosen
 
     def _backward(self, views, surfels, lighting):
-        """Gradients of the mean loss of ``views``; returns what each of them measured, and whether those of the last steps have
-        reached the environment."""
+        """Gradients of the mean loss of ``views``; returns what each of them measured, their mean squared ``error`` in all
+        processes, and whether the gradients of the last steps have reached the environment."""
         # The views share what lies before them: their gradients meet in leaves there, and go the rest of the way once.
         shared = [*(getattr(surfels, name) for name in CHANNELS), *(lighting.learned() if lighting else [])]
         leaves = [type(v)(dr.detach(v)) for v in shared]
@@ -281,23 +280,27 @@ class Fit:
         lighting = lighting and lighting.with_learned(leaves[len(CHANNELS) :], surfels)
         statistics = Gradients(len(self.model))
         measured = [self._view(i, surfels, lighting, 1 / len(views), statistics) for i in views]
+        error = dr.mean([m.pop("error") for m in measured])
         if lighting and self.schedule.explains(self.progress):
             loss = self.objective.residual(surfels, lighting, self.dataset.train[views[0]].camera)
             dr.backward(loss)
             measured.append({"loss.residual": dr.detach(loss)})
         gradients = [dr.grad(leaf) for leaf in leaves]
         gradients = [dr.select(dr.isfinite(g), g, 0) for g in gradients]  # one overflow must not end a fit
-        *gradients, lengths, counts = self.ranks.mean([*gradients, statistics.sum, statistics.count])
-        self.density.gradients.merge(lengths * self.ranks.size, counts * self.ranks.size)
-        reached = False
+        light = None
         if lighting:  # whose maps come first of what it learns
             del shared[len(CHANNELS)]
-            reached = self._light.gather(self.model, self.step_number, gradients.pop(len(CHANNELS)))
+            light = self._light.gather(self.step_number, gradients.pop(len(CHANNELS)))
+        *gradients, lengths, counts, error, light = self.ranks.mean([*gradients, statistics.sum, statistics.count, error, light])
+        self.density.gradients.merge(lengths * self.ranks.size, counts * self.ranks.size)
+        measured.append({"error": error})
+        if light is not None:
+            self._light.pass_on(self.model, light)
         for value, gradient in zip(shared, gradients):
             dr.set_grad(value, gradient)
             dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
-        return measured, reached
+        return measured, light is not None
 
     def _view(self, i, surfels, lighting, weight, statistics):
         """Accumulate the gradients of view ``i``, and density control's ``statistics``; returns its loss's terms and the mean
