@@ -4,7 +4,7 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import NoReturn
 
@@ -47,12 +47,12 @@ def parse_variables(pairs: list[str]) -> dict[str, str]:
 def run_main(main: Callable[[], int | str | None]) -> NoReturn:
     """Call ``main()`` as a command and exit with what it returns: a `UserError` prints one line and exits with 2, Ctrl-C and
     SIGTERM with the code of `Stopped`; warnings print one line each. Nothing that is told ends the command (`telling`)."""
-    with warnings.catch_warnings(), patient_streams(), _terminable():
+    with warnings.catch_warnings(), patient_streams(), _terminable() as stops:
         warnings.showwarning = _print_warning
         try:
             sys.exit(main())
         except (KeyboardInterrupt, Exception) as error:
-            if stop := _stop_behind(error):
+            if stop := _stop_behind(error) or next(iter(stops), None):
                 stopped = stop if isinstance(stop, Stopped) else Stopped(signal.SIGINT)
                 print(stopped, file=sys.stderr)
                 sys.exit(stopped.code)
@@ -66,19 +66,24 @@ def run_main(main: Callable[[], int | str | None]) -> NoReturn:
 
 
 @contextmanager
-def _terminable():
-    """SIGTERM unwinds, so that locks and half-written files go, also in process 1 of a container, which it does not end."""
+def _terminable() -> Iterator[list[Stopped]]:
+    """SIGTERM unwinds, so that locks and half-written files go, also in process 1 of a container, which it does not end, as
+    does Ctrl-C, unless it is ignored. Gives what has been raised: code in between, as of plugins that a scene loads, may make
+    something else of it."""
+    stops: list[Stopped] = []
 
     def stop(number, frame):
-        raise Stopped(number)
+        stops.append(Stopped(number))
+        raise stops[-1]
 
     main = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGTERM, stop) if main else None
+    numbers = [signal.SIGTERM] + [signal.SIGINT] * (signal.getsignal(signal.SIGINT) is signal.default_int_handler)
+    before = {number: signal.signal(number, stop) for number in numbers} if main else {}
     try:
-        yield
+        yield stops
     finally:
-        if main:
-            signal.signal(signal.SIGTERM, signal.SIG_DFL if before is None else before)
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
 def _stop_behind(error):

@@ -40,6 +40,30 @@ def display(color: "mi.Color3f", alpha: "mi.Float", background: "float | mi.Colo
     return dr.select(covered, srgb(color / safe) * alpha, 0) + background * (1 - alpha)
 
 
+class _Evaluated(dr.CustomOp):
+    """The custom operation of `evaluated_adjoint`."""
+
+    def eval(self, color):
+        return color
+
+    def forward(self):
+        self.set_grad_out(self.grad_in("color"))
+
+    def backward(self):
+        adjoint = self.grad_out()
+        dr.eval(adjoint)
+        self.set_grad_in("color", adjoint)
+
+    def name(self):
+        return "rgs_mi.fit.losses.Evaluated"
+
+
+def evaluated_adjoint(color: "mi.Color3f") -> "mi.Color3f":
+    """Return ``color``, whose adjoint is evaluated, once for its channels together: what gathers from it, or sums it up, would
+    make a kernel for each, with all that lies behind."""
+    return dr.custom(_Evaluated, color)
+
+
 class _Blur(dr.CustomOp):
     """SSIM's Gaussian window over a list of images, zero beyond their edges: symmetric, so it is its own adjoint."""
 

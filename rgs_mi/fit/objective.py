@@ -63,7 +63,8 @@ class Objective:
         """
         w, maps, size = self.settings.weights, image.gbuffer.all, photo.camera.size
         color, alpha = losses.completed(image.color, maps.alpha, CUTOFFS.transmittance_min)
-        rendered = losses.display(color if gain is None else color * gain, alpha, photo.behind)
+        color = losses.evaluated_adjoint(color if gain is None else color * gain)
+        rendered = losses.display(color, alpha, photo.behind)
         terms = {"photometric": losses.photometric(rendered, photo.color, size, w.dssim)}
         if w.mask > 0 and masked:
             terms["mask"] = w.mask * losses.mask(alpha, photo.alpha)

@@ -291,7 +291,9 @@ class Fit:
         if lighting:  # whose maps come first of what it learns
             del shared[len(CHANNELS)]
             light = self._light.gather(self.step_number, gradients.pop(len(CHANNELS)))
-        *gradients, lengths, counts, error, light = self.ranks.mean([*gradients, statistics.sum, statistics.count, error, light])
+        *gradients, lengths, counts, error, light = self.ranks.mean(
+            [*gradients, statistics.sum, statistics.count, error, light]
+        )
         self.density.gradients.merge(lengths * self.ranks.size, counts * self.ranks.size)
         measured.append({"error": error})
         if light is not None:

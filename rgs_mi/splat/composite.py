@@ -122,11 +122,12 @@ def _scatter_image(values, layout):
 
 
 class Composite(dr.CustomOp):
-    """The custom operation from projected Gaussians to the image of (2), with its adjoint (3) and its tangent."""
+    """The custom operation from projected Gaussians, the columns of their rows, to the image of (2), with its adjoint (3) and
+    its tangent."""
 
-    def eval(self, gaussian: "mi.Float", isects: TileIntersections, layout: Layout) -> "mi.Float":
-        self.gaussian, self.isects, self.layout = dr.detach(gaussian), isects, layout
-        n = layout.features
+    def eval(self, columns: "list[mi.Float]", isects: TileIntersections, layout: Layout) -> "mi.Float":
+        self.gaussian, self.isects, self.layout = pack([dr.detach(column) for column in columns]), isects, layout
+        self.surfels, n = dr.width(columns), layout.features
 
         def body(surfel, centers, T, out):
             r = fetch(self.gaussian, surfel, layout.gaussian)
@@ -185,11 +186,12 @@ class Composite(dr.CustomOp):
             return T, rest
 
         dr.eval(_walk(self.isects, layout, lambda pixels: rest, body))
-        self.set_grad_in("gaussian", gradient)
+        rows = fetch(gradient, dr.arange(mi.UInt32, self.surfels), layout.gaussian)
+        self.set_grad_in("columns", rows[: len(GEOMETRY) + n + _DERIVATIVES])
 
     def forward(self) -> None:
         layout, n = self.layout, self.layout.features
-        tangent = self.grad_in("gaussian")
+        tangent = pack(self.grad_in("columns"))
 
         def body(surfel, centers, T, state):
             r, r_ = (fetch(b, surfel, layout.gaussian) for b in (self.gaussian, tangent))
@@ -220,7 +222,7 @@ def composite(projected: Projected, features: "list[mi.Float]", isects: TileInte
     padding). ``features`` have width N, the normal's three come after the first three. Differentiable in the projected
     Gaussians, in both modes."""
     normal_derivatives = [value for derivative in projected.normal_derivatives for value in derivative]
-    return dr.custom(Composite, pack(projected.geometry + features + normal_derivatives), isects, layout)
+    return dr.custom(Composite, projected.geometry + features + normal_derivatives, isects, layout)
 
 
 def median_depth(projected: Projected, isects: TileIntersections, size: tuple[int, int]) -> "mi.Float":

@@ -171,7 +171,7 @@ class _Split(dr.CustomOp):
 
     def backward(self):
         adjoint = list(self.grad_out())
-        dr.eval(adjoint)
+        dr.eval(adjoint)  # otherwise every scatter below would compute them again
         columns = iter(adjoint)
         self.set_grad_in("arrays", [self._join([next(columns) for _ in range(n)]) for n in self.channels])
 
@@ -181,9 +181,10 @@ class _Split(dr.CustomOp):
 
     def _join(self, columns):
         """The rows that have these ``columns``."""
-        entry, count = dr.arange(mi.UInt32, self.rows * len(columns)), len(columns)
-        row, own = entry // count, entry % count
-        return sum((dr.gather(mi.Float, column, row, own == k) for k, column in enumerate(columns)), mi.Float(0))
+        rows, first = dr.empty(mi.Float, self.rows * len(columns)), dr.arange(mi.UInt32, self.rows) * len(columns)
+        for k, column in enumerate(columns):
+            dr.scatter(rows, column, first + k)
+        return rows
 
     def name(self):
         return "rgs_mi.surfels.Split"

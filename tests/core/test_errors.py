@@ -85,3 +85,17 @@ def test_signals_that_were_wrapped_have_their_codes(wrapped, capsys):
             raise wrapped from stop
 
     assert outcome(main, capsys) == (143, "interrupted\n")
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_signals_that_plugins_swallowed_have_their_codes(number, code, capsys):
+    """As when they come while a scene loads: Mitsuba makes of what a plugin raises an error of its own, without a cause."""
+
+    def main():
+        try:
+            signal.raise_signal(number)
+        except KeyboardInterrupt:
+            pass
+        raise UserError("cannot load ball.xml")
+
+    assert outcome(main, capsys) == (code, "interrupted\n")
