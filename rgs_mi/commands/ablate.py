@@ -9,17 +9,18 @@ pictures. What `rgs-mi ablate` calls.
 import itertools
 import sys
 import warnings
+from collections import Counter
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..core.errors import UserError
 from ..core.subprocesses import apart
 from ..fit.scene import FitScene
 from ..report import pictures
 from ..report.tables import mean_tables, means, scene_table
 from ..settings.config import presets, to_dict
-from .jobs import Job, check_names, check_photographs, effort, find_scenes, fit, photographs, rows_of, write_tables
+from .jobs import Job, check_names, each_fitted, effort, find_scenes, photographs, rows_of, write_tables
 from .optimize import budget
 
 
@@ -148,6 +149,8 @@ def ablate(
     minutes: float | None = None,
     overrides: Sequence[str] = (),
     seeds: Sequence[int] = (0,),
+    workers: int = 1,
+    scheduler: str | None = None,
     out: str | Path = "runs/ablation",
     quiet: bool = False,
 ) -> int:
@@ -160,6 +163,7 @@ def ablate(
                 show what earlier calls with the same settings have left in ``out``
       minutes, overrides: budget and settings ('a.b=value') of every fit, over what the variants say
       seeds:    each fit is done with each of these
+      workers, scheduler: see `each_fitted`
 
     Returns: how many fits failed. Each has its error in the tables, in one line, and does not keep others from being done.
     Raises: UserError where nothing can be done at all; KeyboardInterrupt after Ctrl-C.
@@ -167,9 +171,18 @@ def ablate(
     out, errors = Path(out), {}
     jobs = plan(suite, xml, scenes=scenes, variants=variants, minutes=minutes, overrides=overrides, seeds=seeds, out=out)
     asked = [job for job in jobs if job.asked]
+    left = Counter(job.scene for job in asked)
+    fits = each_fitted(xml, asked, workers=workers, scheduler=scheduler, quiet=quiet)
     try:
-        for _, group in itertools.groupby(asked, lambda job: (job.seed, job.scene)):
-            _fit_scene(list(group), jobs, errors, xml, out, quiet)
+        with closing(fits):
+            for job, error in fits:
+                if error:
+                    errors[job.folder] = str(error)
+                    print(f"{job.folder}: {error}", file=sys.stderr)
+                left[job.scene] -= 1
+                if not left[job.scene]:
+                    _picture(job.scene, jobs, errors, xml, out)
+                _write(jobs, errors, out)
     except KeyboardInterrupt:
         print("stopped; the same command goes on from here", file=sys.stderr)
         raise
@@ -179,46 +192,20 @@ def ablate(
     return len(errors)
 
 
-def _fit_scene(group, jobs, errors, xml, out, quiet):
-    """The fits of one scene with one seed, and its picture."""
+# ---- What comes out ----
 
-    def failed(job, error):
-        errors[job.folder] = str(error)
-        print(f"{job.folder}: {error}", file=sys.stderr)
 
-    scene = group[0].scene
-    try:
-        digest, views = apart(photographs, xml, group[0].data, group[0].settings["resolution"], quiet)
-        check_photographs([job.folder for job in group], digest)
-    except UserError as error:
-        for job in group:
-            failed(job, error)
-        _write(jobs, errors, out)
+def _picture(scene, jobs, errors, xml, out):
+    """The picture of the fits of a ``scene`` that are there, with the first seed."""
+    there = [j for j in jobs if (j.scene, j.seed) == (scene, jobs[0].seed) and j.folder not in errors and j.figures()]
+    if not there:
         return
     try:
-        for job in group:
-            if job.figures() is None:
-                if not quiet:
-                    print(job.folder, flush=True)
-                try:
-                    apart(fit, xml, job, quiet)
-                except UserError as error:
-                    failed(job, error)
-                _write(jobs, errors, out)
-    finally:
-        columns = [
-            (known_variants()[job.variant].label, job.figures(), job.folder)
-            for job in jobs
-            if (job.scene, job.seed) == (scene, jobs[0].seed) and job.folder not in errors and job.figures()
-        ]
-        try:
-            if columns:
-                pictures.write(out / f"{scene}.png", views, columns, group[0].settings["background"])
-        except Exception as error:  # of a damaged run
-            warnings.warn(f"{out / scene}: no picture ({type(error).__name__}: {error})", stacklevel=2)
-
-
-# ---- What comes out ----
+        _, views = apart(photographs, xml, there[0].data, there[0].settings["resolution"], True)
+        columns = [(known_variants()[job.variant].label, job.figures(), job.folder) for job in there]
+        pictures.write(out / f"{scene}.png", views, columns, there[0].settings["background"])
+    except Exception as error:  # of a damaged run
+        warnings.warn(f"{out / scene}: no picture ({type(error).__name__}: {error})", stacklevel=2)
 
 
 def _write(jobs, errors, out):

@@ -1,16 +1,20 @@
-"""Fits of a suite of scenes, each done once and gone on with where it was interrupted: what `ablate` and `suite` share."""
+"""Fits of a suite of scenes, each done once and gone on with where it was interrupted, on this machine or on a cluster: what
+`ablate` and `suite` share."""
 
 import contextlib
 import io
 import json
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Generator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..core.cluster import each_on
 from ..core.errors import Stopped, UserError
 from ..core.files import atomic_file
 from ..core.ownership import owned
+from ..core.subprocesses import each_apart
 from ..datasets import is_capture, looked_for
 from ..datasets.types import View
 from ..fit import checkpoint
@@ -91,13 +95,40 @@ def photographs(xml: str | Path, data: str | Path, longest: int, quiet: bool) ->
     return dataset.digest, results.preview_views(results.evaluation_views(dataset))[::2]
 
 
-def check_photographs(folders: Iterable[Path], digest: str) -> None:
-    """Check that the runs that are there of ``folders`` are of the photographs with this ``digest``. Raises: UserError where one
-    is of others."""
-    for folder in folders:
-        saved = results.saved_figures(folder)
+def each_fitted(
+    xml: str | Path, jobs: Sequence[Job], *, workers: int = 1, scheduler: str | None = None, quiet: bool = False
+) -> Generator[tuple[Job, UserError | None], None, None]:
+    """Do each of ``jobs``, fits of the scene file ``xml``, unless that is done, in processes of their own: up to ``workers`` at a
+    time on this machine, or on those of the Dask cluster at the address ``scheduler``. To be closed.
+
+    Yields: (job, what went wrong or None), as they end.
+    Raises: UserError where nothing can be done at all; KeyboardInterrupt after Ctrl-C, when all have saved.
+    """
+    if workers < 1:
+        raise UserError(f"--workers {workers}: needs at least 1")
+    calls = [(xml, job, quiet or workers > 1 or scheduler is not None) for job in jobs]
+    return _told(each_on(scheduler, _done, calls) if scheduler else each_apart(_done, calls, workers))
+
+
+def _told(ended):
+    with closing(ended):
+        for (_, job, _), _, error in ended:
+            yield job, error
+
+
+def _done(xml, job, quiet):
+    """Do a job, unless that is done. Raises: UserError where it fails, or is stopped, and where the run that is there is of other
+    photographs."""
+    digest, _ = photographs(xml, job.data, job.settings["resolution"], quiet)
+    # another call may be at it, or a worker that has died and still saves
+    with owned(job.folder, wait=True):
+        saved = results.saved_figures(job.folder)
         if saved and dict(saved.get("digests") or ()).get("photographs") != digest:
-            raise UserError(f"{folder} holds a fit to other photographs: delete it, or choose another --out")
+            raise UserError(f"{job.folder} holds a fit to other photographs: delete it, or choose another --out")
+    if job.figures() is None:
+        if not quiet:
+            print(job.folder, flush=True)
+        fit(xml, job, quiet)
 
 
 def fit(xml: str | Path, job: Job, quiet: bool) -> None:

@@ -11,13 +11,11 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
-from ..core.errors import UserError
-from ..core.subprocesses import each_apart
 from ..fit.scene import FitScene
 from ..report import paper_results, write_suite
 from ..report.tables import DETAILS, FIGURES, mean, scene_table
 from ..settings.config import to_dict
-from .jobs import Job, check_names, check_photographs, effort, find_scenes, fit, photographs, rows_of, write_tables
+from .jobs import Job, check_names, each_fitted, effort, find_scenes, rows_of, write_tables
 from .optimize import budget
 
 NAME = "suite"
@@ -70,6 +68,7 @@ def fit_suite(
     minutes: float | None = None,
     overrides: Sequence[str] = (),
     workers: int = 1,
+    scheduler: str | None = None,
     out: str | Path = "runs/suite",
     quiet: bool = False,
 ) -> int:
@@ -82,19 +81,18 @@ def fit_suite(
       scenes:  names, those to fit (None: all). The tables also show what other calls with the same settings have left in
                ``out``: jobs of a cluster may fit a scene each, and a last call, with nothing left to fit, write the tables
       config, minutes, overrides: preset or file, budget, settings ('a.b=value') of every fit
-      workers: fits at a time, among which the cores of this machine are divided
+      workers, scheduler: see `each_fitted`
 
     Returns: how many scenes failed. Each has its error in the tables, in one line, and does not keep others from being done.
     Raises: UserError where nothing can be done at all; KeyboardInterrupt after Ctrl-C.
     """
-    if workers < 1:
-        raise UserError(f"--workers {workers}: needs at least 1")
     out, errors = Path(out), {}
     jobs = plan(root, xml, scenes=scenes, config=config, minutes=minutes, overrides=overrides, out=out)
-    calls = [(xml, job, quiet or workers > 1) for job in jobs if job.asked]
+    asked = [job for job in jobs if job.asked]
+    fits = each_fitted(xml, asked, workers=workers, scheduler=scheduler, quiet=quiet)
     try:
-        with closing(each_apart(_scene, calls, workers)) as ended:
-            for (_, job, _), _, error in ended:
+        with closing(fits):
+            for job, error in fits:
                 if error:
                     errors[job.folder] = str(error)
                     print(f"{job.scene}: {error}", file=sys.stderr)
@@ -118,15 +116,6 @@ def fit_suite(
         )
     print("\n".join([text, "", *map(str, (*paths, page))]))
     return len(errors)
-
-
-def _scene(xml, job, quiet):
-    """Fit a scene, unless that is done."""
-    check_photographs([job.folder], photographs(xml, job.data, job.settings["resolution"], quiet)[0])
-    if job.figures() is None:
-        if not quiet:
-            print(job.folder, flush=True)
-        fit(xml, job, quiet)
 
 
 def _write(jobs, errors, out):

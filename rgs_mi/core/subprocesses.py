@@ -44,7 +44,7 @@ def each_apart(
     try:
         while waiting or running:
             while waiting and len(running) < workers:
-                call = _Call(function, waiting.pop(0), threads)
+                call = Call(function, waiting.pop(0), threads)
                 running[call.receive] = call
             for receive in wait(list(running)):
                 result = running[receive].result()
@@ -60,23 +60,27 @@ def each_apart(
             call.process.kill()
 
 
-class _Call:
-    """A call that runs in ``process``, and ends with something to ``receive``."""
+class Call:
+    """A call of ``function`` that runs in ``process``, on so many ``threads`` (None: all), and ends with something to
+    ``receive``."""
 
-    def __init__(self, function, arguments, threads):
+    def __init__(self, function: Callable, arguments: tuple, threads: int | None = None) -> None:
         self.arguments = arguments
         context = multiprocessing.get_context("spawn")
         self.receive, send = context.Pipe(duplex=False)
         self.process = context.Process(target=_work, args=(send, mi.variant(), threads, function, arguments))
-        before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # inherited: of Ctrl-C the process hears from us alone
+        main = threading.current_thread() is threading.main_thread()  # where alone handlers can be set
+        # inherited: of Ctrl-C the process hears from us alone
+        before = signal.signal(signal.SIGINT, signal.SIG_IGN) if main else None
         try:
             self.process.start()
         finally:
-            signal.signal(signal.SIGINT, before)
+            if main:
+                signal.signal(signal.SIGINT, before)
         send.close()
 
-    def result(self):
-        """(value, None) or (None, UserError)."""
+    def result(self) -> tuple[Any, UserError | None]:
+        """Wait for its end, and return (value, None) or (None, UserError)."""
         try:
             value, error = self.receive.recv()
         except (EOFError, OSError):  # it ended without a word, or in the middle of one
@@ -114,6 +118,6 @@ def _work(send, variant, threads, function, arguments):
 
 def _end_with_parent():
     parent = multiprocessing.parent_process()
-    assert parent is not None, "this runs in a process that `_Call` started"
+    assert parent is not None, "this runs in a process that `Call` started"
     parent.join()
     os.kill(os.getpid(), signal.SIGTERM)

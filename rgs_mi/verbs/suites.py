@@ -14,6 +14,7 @@ def ablate(parser: Parser) -> Run:
     add_names(parser, "--variants", "these only: rows of the table in rgs_mi/commands/ablate.py, or presets")
     add_budget(parser, config=False)
     add_names(parser, "--seeds", "of everything random; fit with each (default: 0)", int, "N,M", default=[0])
+    _add_workers(parser)
     add_out(parser, "runs/ablation", "folder of the tables and of all runs")
     add_common(parser)
 
@@ -22,7 +23,7 @@ def ablate(parser: Parser) -> Run:
         set_variant(args.variant)
         from ..commands.ablate import ablate
 
-        names = ("scenes", "variants", "minutes", "overrides", "seeds", "out", "quiet")
+        names = ("scenes", "variants", "minutes", "overrides", "seeds", "workers", "scheduler", "out", "quiet")
         return bool(ablate(args.suite, bundled("scenes")["object"], **{name: getattr(args, name) for name in names}))
 
     return run
@@ -40,6 +41,15 @@ def _suite_of(parser: Parser, name: str):
     add_names(parser, "--scenes", "these only")
 
 
+def _add_workers(parser: Parser):
+    add_integer(parser, "--workers", 1, "fits at a time, which share the cores, and with them the FPS")
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="of a Dask cluster (tcp://HOST:8786), whose workers fit instead, on a shared disk: pip install 'rgs-mi[cluster]'",
+    )
+
+
 def benchmark(parser: Parser) -> Run:
     """Fit and judge a suite of captures beside the paper's tables; or time the splatter, or the step of a fit."""
     commands = parser.add_subparsers(dest="command", required=True, parser_class=Parser)
@@ -53,11 +63,10 @@ def benchmark(parser: Parser) -> Run:
 
 def _suite(parser: Parser) -> Run:
     """Fit and judge all captures of a folder; the same command goes on where it was interrupted, and does not repeat what is
-    done. On a cluster: one job a scene with --scenes NAME, all with the same settings and --out, and at last the same without
-    --scenes for the tables."""
+    done."""
     _suite_of(parser, "root")
     add_budget(parser)
-    add_integer(parser, "--workers", 1, "fits at a time, which share the cores, and with them the FPS")
+    _add_workers(parser)
     add_out(parser, "runs/suite", "folder of the tables and of all runs")
 
     def run(args):
@@ -65,7 +74,7 @@ def _suite(parser: Parser) -> Run:
         set_variant(args.variant)
         from ..commands.suite import fit_suite
 
-        names = ("scenes", "config", "minutes", "overrides", "workers", "out", "quiet")
+        names = ("scenes", "config", "minutes", "overrides", "workers", "scheduler", "out", "quiet")
         return bool(fit_suite(args.root, bundled("scenes")["object"], **{name: getattr(args, name) for name in names}))
 
     return run

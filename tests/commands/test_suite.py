@@ -30,29 +30,6 @@ def captures(inputs, tmp_path_factory):
     return make_suite(*inputs, tmp_path_factory.mktemp("suite"), "car", "helmet")
 
 
-@pytest.fixture
-def inside(monkeypatch, tmp_path):
-    """Fits run in this process, and are noted."""
-    fitted = []
-
-    def each(function, calls, workers):
-        for arguments in calls:
-            try:
-                yield arguments, function(*arguments), None
-            except UserError as error:
-                yield arguments, None, error
-
-    def fit(xml, job, quiet):
-        fitted.append(job.scene)
-        return fit_job(xml, job, quiet)
-
-    fit_job = jobs.fit
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(suite, "each_apart", each)
-    monkeypatch.setattr(suite, "fit", fit)
-    return fitted
-
-
 def call(captures, out, **options):
     scene, root = captures
     return suite.fit_suite(root, scene, out=out, **{"overrides": SMALL, "quiet": True} | options)
@@ -104,10 +81,10 @@ def test_mistakes(captures, tmp_path, options, message):
 
 def test_goes_on(captures, tmp_path, inside, capsys):
     out = tmp_path / "out"
-    assert call(captures, out, scenes=["helmet"]) == 0 and inside == ["helmet"]
+    assert call(captures, out, scenes=["helmet"]) == 0 and inside == ["helmet/default"]
     assert [(r["scene"], r["status"]) for r in read(out)["runs"]] == [("helmet", "finished")]
     assert read(out)["means"]["Shiny Blender"]["scenes"] == 1
-    assert call(captures, out) == 0 and inside == ["helmet", "car"]  # as another job of a cluster would
+    assert call(captures, out) == 0 and inside == ["helmet/default", "car/default"]  # as another job of a cluster would
     first = read(out)
     metrics = json.loads((out / "car" / "metrics.json").read_text())
     assert first["runs"][0]["scene"] == "car"
@@ -129,7 +106,7 @@ def test_goes_on(captures, tmp_path, inside, capsys):
         assert [float(r["psnr"]) for r in csv.DictReader(stream)] == [r["psnr"] for r in first["runs"]]
 
     call(captures, out, scenes=["car"], overrides=[*SMALL, "iterations=2"])
-    assert inside[2:] == ["car"] and [(r["scene"], r["iterations"]) for r in read(out)["runs"]] == [("car", 2)]
+    assert inside[2:] == ["car/default"] and [(r["scene"], r["iterations"]) for r in read(out)["runs"]] == [("car", 2)]
     assert json.loads((out / "car.1" / "metrics.json").read_text()) == metrics  # what was finished is not lost
     (out / "car" / "metrics.json").unlink()  # nor is what was begun
     with pytest.warns(UserWarning, match=r"car had other settings: it is .*car\.2 now"):
@@ -148,7 +125,7 @@ def test_a_damaged_run_ends_no_suite(captures, tmp_path, inside):
         (out / "helmet" / "metrics.json").write_text(content)
         assert results.saved_figures(out / "helmet") is None
     assert call(captures, out, scenes=["helmet"]) == 0 and [r["status"] for r in read(out)["runs"]] == ["finished"]
-    assert inside == ["helmet"] * 2
+    assert inside == ["helmet/default"] * 2
 
 
 def test_failures_are_told(captures, tmp_path, inside, capsys):
@@ -168,7 +145,7 @@ def test_failures_are_told(captures, tmp_path, inside, capsys):
     assert "bad: " in capsys.readouterr().err
 
     (out / "car" / "metrics.json").unlink()
-    assert call((captures[0], root), out) == 1 and inside == ["car"]
+    assert call((captures[0], root), out) == 1 and inside == ["car/default"]
     assert [r["status"] for r in read(out)["runs"]] == ["failed", "finished"]
 
 
