@@ -137,9 +137,10 @@ class Model:
     def surfels(self, sh_order: int) -> Surfels:
         """Return the surfels, with spherical harmonics up to ``sh_order``; differentiable."""
         p = self.optimizer
-        sh = p["sh_dc"]
-        if sh_order > 0:
-            sh = dr.concat((sh, p["sh_rest"][:, : 3 * ((sh_order + 1) ** 2 - 1)]), axis=1)
+        sh, rest, used = p["sh_dc"], p["sh_rest"], 3 * ((sh_order + 1) ** 2 - 1)
+        if used:
+            # a slice of all of it would be a copy, and another one in the derivative
+            sh = dr.concat((sh, rest if used == rest.shape[1] else rest[:, :used]), axis=1)
         scales = dr.maximum(dr.exp(p["log_scales"]), _LEAST_SCALE)
         return Surfels(
             p["centers"],
