@@ -25,7 +25,8 @@ def each_on(
     one at a time on each thread of theirs: each in a process of its own, under the same Mitsuba variant and in the folder of
     the same name as the current one, so that relative paths of a shared disk mean the same. Pickle must take all of it.
 
-    Where a worker dies its process hears of it, as of SIGTERM (see `GracefulInterrupt`), and Dask has another worker call again.
+    Where a worker dies or is retired, its process hears of it, as of SIGTERM (see `GracefulInterrupt`), and another worker calls
+    again.
 
     Yields: (arguments, value, None) or (arguments, None, UserError), as they end.
     Raises: UserError where there is no such cluster; KeyboardInterrupt after Ctrl-C, when all have ended.
@@ -74,8 +75,12 @@ def _there(function, arguments, variant, folder, name):
     worker, stop = distributed.get_worker(), distributed.Event(name)
     call = Call(_inside, (folder, function, *arguments))
     while not wait([call.receive], _ASKS):
+        if worker.status in (distributed.Status.closing, distributed.Status.closing_gracefully, distributed.Status.closed):
+            call.process.terminate()
+            call.process.join()
+            raise distributed.Reschedule()
         with suppress(OSError):  # without a scheduler a worker ends by itself
-            if stop.is_set() or worker.status != distributed.Status.running:
+            if stop.is_set():
                 call.process.terminate()
                 break
     return call.result()
