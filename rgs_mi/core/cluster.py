@@ -48,12 +48,13 @@ def each_on(
             for arguments in calls
         }
         try:
-            for future in distributed.as_completed(submitted):
-                value, error = _result(future)
-                yield submitted[future], value, error
+            for future in distributed.as_completed(list(submitted)):
+                arguments, (value, error) = submitted.pop(future), _result(future)
+                del future  # so that no cluster keeps what came out, or makes it again where a worker that has it dies
+                yield arguments, value, error
         except (KeyboardInterrupt, GeneratorExit):
             distributed.Event(name, client=client).set()
-            distributed.wait(submitted)
+            distributed.wait(list(submitted))
             raise
 
 
