@@ -6,7 +6,6 @@ import io
 import json
 import warnings
 from collections.abc import Collection, Generator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -111,7 +110,7 @@ def each_fitted(
 
 
 def _told(ended):
-    with closing(ended):
+    with contextlib.closing(ended):
         for (_, job, _), _, error in ended:
             yield job, error
 

@@ -51,22 +51,20 @@ class Ranks:
             return list(arrays)
         import torch.distributed
 
-        flat = [a.array if dr.is_tensor_v(a) else a for a in arrays if a is not None]
+        there = [array for array in arrays if array is not None]
+        flat = [a.array if dr.is_tensor_v(a) else a for a in there]
         together: Any = dr.concat(flat)
         dr.eval(together)
         with _together(self):
             torch.distributed.all_reduce(shared := together.torch())
         together, means, first = mi.Float(shared) / self.size, [], 0
-        for array in arrays:
-            if array is None:
-                means.append(None)
-                continue
-            width = dr.width(array.array if dr.is_tensor_v(array) else array)
-            own = dr.gather(mi.Float, together, dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, width))
+        for array, part in zip(there, flat):
+            own = dr.gather(mi.Float, together, dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, dr.width(part)))
             means.append(type(array)(own, array.shape) if dr.is_tensor_v(array) else own)
-            first += width
+            first += dr.width(part)
         dr.eval(means)
-        return means
+        ordered = iter(means)
+        return [None if array is None else next(ordered) for array in arrays]
 
     def gather(self, value: T) -> list[T]:
         """Return what each process gives as ``value``, in their order; anything that can be pickled."""

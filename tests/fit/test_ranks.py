@@ -49,7 +49,8 @@ def test_two_processes_are_one_with_twice_the_views(tmp_path):
     assert found["psnr"] == pytest.approx(one.psnr, abs=0.01) and len(one.model) > 300
     for name, expected in arrays.items():
         apart, size = np.abs(found[name].astype(float) - expected.astype(float)), np.abs(expected).mean()
-        assert np.quantile(apart, 0.95) <= 5e-3 * size + 1e-7, name
+        limit = 5e-3 if "intrinsics" in name else 1e-3  # of eight numbers nearly the largest
+        assert np.quantile(apart, 0.95) <= limit * size + 1e-7, name
     other, _ = stepped(LEARNED, Ranks()).state()
     assert other["centers"].shape != arrays["centers"].shape or np.abs(other["centers"] - arrays["centers"]).max() > 1e-3
 
