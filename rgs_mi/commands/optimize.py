@@ -14,11 +14,13 @@ import numpy as np
 
 from .. import report
 from ..core.bounding_box import BoundingBox
+from ..core.camera import Camera
 from ..core.errors import Stopped, UserError
 from ..core.interrupt import GracefulInterrupt
 from ..core.ownership import Owned, owned
 from ..core.progress import Progress
 from ..core.runtime import cache_folder
+from ..datasets.rims import without_rim
 from ..datasets.types import Dataset
 from ..export.mitsuba_scene import SCENE
 from ..fit import checkpoint, events, light
@@ -29,6 +31,7 @@ from ..fit.scene import FitScene
 from ..fit.trainer import Fit
 from ..priors import depth_priors
 from ..priors.initialization import initial_points, surroundings
+from ..priors.silhouettes import agreement
 from ..report import results
 from ..settings.config import to_dict
 from ..settings.settings import Settings
@@ -167,7 +170,10 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
         print(seen)
     begin = settings.initialization
     assert begin.surfels, "`planned` gives them"
-    points = initial_points(dataset, begin.surfels, settings.seed, begin.hull, begin.compare, quiet)
+    trimmed = [without_rim(view, settings.mask_rim or 0) for view in dataset.train]
+    cameras = _begun_cameras(trimmed, settings, quiet)
+    placed = replace(dataset, train=[replace(view, camera=cameras.get(view.name, view.camera)) for view in trimmed])
+    points = initial_points(placed, begin.surfels, settings.seed, begin.hull, begin.compare, quiet)
     random = points[1] is None and not (dataset.points is not None and len(dataset.points))
     opacity = begin.opacity or (_ANYWHERE if random else _ON_SURFACE)
     if settings.box is None and not any(view.masked for view in dataset.train):
@@ -202,12 +208,28 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
             two_sided=None if box is None else True,
             room=(center, settings.room * extent) if settings.room else None,
         )
-        return Fit(shown, model, settings, extent, shading, _priors(shown, settings))
+        fit = Fit(shown, model, settings, extent, shading, _priors(shown, settings))
+        if fit.cameras:
+            fit.cameras.begin([cameras.get(view.name, view.camera) for view in shown.train])
+        return fit
 
     if settings.light == "auto":
         settings = light.tried(fit_of, dataset, settings, quiet)
     settings = light.ring_turns(fit_of, dataset, settings, quiet)
     return fit_of(dataset, settings)
+
+
+def _begun_cameras(views, settings, quiet) -> dict[str, Camera]:
+    """The cameras that training ``views`` begin with where those are not the given ones, by the views' names."""
+    if settings.cameras != "learned" or not settings.initialization.silhouettes:
+        return {}
+    found = agreement(views)
+    if found is None or not found.better:
+        return {}
+    if not quiet:
+        moved = "poses begin where silhouettes agree"
+        print(f"{moved}: of two photographs, to {found.now:.2f} pixels, not {found.given:.1f} as cameras are given")
+    return {view.name: camera for view, camera in zip(views, found.cameras)}
 
 
 def _with_surroundings(points, dataset, settings):

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from .lens import Lens
 
@@ -95,6 +96,14 @@ def learned_camera(
         dr.scatter(values, value, mi.UInt32(k))
     dr.eval(values)
     return LearnedCamera(values, float(lens.reach))
+
+
+def correction(camera: "Camera", moved: "Camera", pivot: np.ndarray) -> np.ndarray:
+    """Return the six numbers (ω, τ) by which `learned_camera` takes the pose of ``camera`` to that of ``moved``, about the
+    ``pivot`` ([3], world space): (12) the other way round."""
+    turn = Rotation.from_matrix(moved.rotation @ camera.rotation.T).as_quat(canonical=True)
+    before, after = (c.rotation @ (np.asarray(pivot) - c.origin) for c in (camera, moved))
+    return np.concatenate([2 * turn[:3] / turn[3], (after - before) / np.linalg.norm(before)])
 
 
 def lens_reach(camera: "Camera") -> float:

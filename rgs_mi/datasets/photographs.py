@@ -12,6 +12,7 @@ from ..core.arrays import as_float
 from ..core.camera import Camera
 from ..core.color import display
 from .images import resize
+from .rims import without_rim
 from .types import DepthPrior, View
 
 MOST_PIXELS = 320_000  # that a step looks at: of larger windows one tile at a time, for more steps and less memory
@@ -53,8 +54,9 @@ class Photographs:
     windows of more than `MOST_PIXELS`, to tiles of one size.
 
     ``downscale`` is how many pixels of a view's side make one of the level's; ``background`` a display value; ``priors`` has
-    one entry per view. Where masks may be wrong, within ``tolerance`` pixels of a view from their borders, the photograph
-    itself is what lies behind: a surface that looks different does not belong there, and transparency costs nothing.
+    one entry per view. Masks are too large by ``rim`` pixels of a view (`rims`). Where they may be wrong, within ``tolerance``
+    pixels of a view from their borders, the photograph itself is what lies behind: a surface that looks different does not
+    belong there, and transparency costs nothing.
     """
 
     def __init__(
@@ -64,9 +66,10 @@ class Photographs:
         background: float,
         priors: Sequence[DepthPrior] | None = None,
         tolerance: int = 0,
+        rim: int = 0,
     ) -> None:
         self.views, self.downscale, self.background, self.priors = views, downscale, background, priors
-        self.tolerance = tolerance
+        self.tolerance, self.rim = tolerance, rim
         self._images = {}
         self._windows = _windows(views, downscale)
 
@@ -103,7 +106,7 @@ class Photographs:
     def _images_of(self, i):
         """Of this level: colour over black, coverage and, where that is no grey level, what lies behind, [H, W, 4 or 7]; and
         the prior [H, W, 1], or [H, W, 0] where there is none."""
-        view = self.views[i]
+        view = without_rim(self.views[i], self.rim)
         images = [display(view.pixels, 0.0), view.alpha[..., None]]
         if self.tolerance and view.masked:
             opaque = view.pixels.copy()

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.camera import Camera, focus_point
-from ..core.learned_camera import INTRINSICS, POSE, learned_camera
+from ..core.learned_camera import INTRINSICS, POSE, correction, learned_camera
 from ..datasets.exif import log_gains
 from ..datasets.types import Dataset
 from ..settings.settings import Settings, Weights
@@ -105,15 +105,21 @@ class Cameras:
             fitted.rows[EXPOSURE].value += log_gains([view.path for view in dataset.train])[:, None]
         return fitted
 
+    def begin(self, cameras: Sequence[Camera]) -> None:
+        """Begin with the poses of these ``cameras``, one for each view, where cameras are learned."""
+        if POSES in self.rows:
+            pairs = zip(self.given, cameras, strict=True)
+            self.rows[POSES].value[:] = [correction(given, moved, self.pivot) for given, moved in pairs]
+
     # ---- A step ----
 
     def see(self, view: int, camera: Camera, weights: Weights, started: bool = True) -> Seen:
         """Return how a step sees the ``view`` of this index through ``camera``, a window or another size of its own, with
-        gradients for the next `step`. Cameras are the given ones until they have ``started``."""
+        gradients for the next `step`. Cameras stay as they begin until they have ``started``."""
         gain, prior = None, mi.Float(0)
-        if POSES in self.rows and started:
+        if POSES in self.rows:
             kind = self._kinds[_kind(self.given[view])]
-            pose, intrinsics = self._leaf(POSES, view), self._leaf(LENSES, kind)
+            pose, intrinsics = (self._leaf(name, row, started) for name, row in ((POSES, view), (LENSES, kind)))
             camera = replace(camera, learned=learned_camera(self.given[view], self.pivot, pose, intrinsics))
             squares = lambda values: sum((dr.square(v) for v in values), mi.Float(0))
             prior += dr.opaque(mi.Float, weights.poses) * squares(pose)
@@ -123,10 +129,11 @@ class Cameras:
             dr.eval(gain)
         return Seen(camera, gain, prior)
 
-    def _leaf(self, name, row):
+    def _leaf(self, name, row, learned=True):
         leaf = [dr.opaque(mi.Float, v) for v in self.rows[name].value[row].tolist()]
-        dr.enable_grad(leaf)
-        self._leaves.append((name, row, leaf))
+        if learned:
+            dr.enable_grad(leaf)
+            self._leaves.append((name, row, leaf))
         return leaf
 
     def gradients(self) -> dict[str, dict[int, np.ndarray]]:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..datasets.rims import rim
 from ..datasets.types import Dataset, View
 from ..settings.settings import Settings, Stage
 
@@ -20,6 +21,7 @@ _OPEN = (
     "max_surfels",
     "surfels",
     "stages",
+    "mask_rim",
     "box",
     "light",
     "turns",
@@ -33,6 +35,7 @@ def planned(settings: Settings, dataset: Dataset) -> Settings:
     - `density.max_surfels`: 50 000, or 5000 a minute; of photographs, which have relief, as many as one shows pixels of the
       object, in the mean, if that is more; but 15 000 a minute at most, and 25 000, up to 250 000, where they have no masks;
     - `initialization.surfels`: half of these, or three quarters where photographs have no masks; 25 000 at least;
+    - `mask_rim`: of photographs, as far within their masks as the object begins (`rims.rim`);
     - `stages`: halves of halves down to the pixels of a square of some 220; from 20 % of the fit on all pixels, from 10 % on
       half of them along a side, and so on.
     """
@@ -44,12 +47,16 @@ def planned(settings: Settings, dataset: Dataset) -> Settings:
         most = int(max(_SURFELS, _A_MINUTE * minutes, min(limit, shown)))
     if first is None:
         first = min(max(_FIRST, most * 3 // 4 if bare else most // 2), most)
+    edge = settings.mask_rim
+    if edge is None:
+        edge = rim(dataset.train) if dataset.photographed else 0
     stages = settings.stages or _stages(int(np.prod(dataset.train[0].camera.size)))
     return replace(
         settings,
         density=replace(density, max_surfels=most),
         initialization=replace(settings.initialization, surfels=first),
         stages=stages,
+        mask_rim=edge,
     )
 
 
@@ -59,12 +66,16 @@ def told(settings: Settings, dataset: Dataset) -> str:
     masked = sum(view.masked for view in dataset.train)
     masks = "with masks" if masked == len(dataset.train) else f"{masked} of them with masks" if masked else "without masks"
     kind = "photographs" if dataset.photographed else "images of known cameras"
-    chosen = {
-        "cameras": settings.cameras,
-        "exposure": settings.exposure,
-        "light": settings.light,
-        "density.max_surfels": settings.density.max_surfels,
-    } | ({} if settings.box is None else {"box": "[" + ", ".join(f"{v:.7g}" for v in settings.box) + "]"})
+    chosen = (
+        {
+            "cameras": settings.cameras,
+            "exposure": settings.exposure,
+            "light": settings.light,
+            "density.max_surfels": settings.density.max_surfels,
+        }
+        | ({"mask_rim": settings.mask_rim} if settings.mask_rim else {})
+        | ({} if settings.box is None else {"box": "[" + ", ".join(f"{v:.7g}" for v in settings.box) + "]"})
+    )
     return (
         f"{len(dataset.train)} {kind} of {width} x {height} pixels, {masks}, and {len(dataset.test)} held out: "
         + ", ".join(f"{name}={value}" for name, value in chosen.items())

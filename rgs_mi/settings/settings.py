@@ -48,6 +48,11 @@ class Initialization:
         description="Photographs are compared first: surfels start where they agree on a depth, and not where they look through "
         "the hull.",
     )
+    silhouettes: bool = Field(
+        default=True,
+        description="Where cameras are learned, poses begin where the photographs' masks agree, if they agree much better there "
+        "than as they are given.",
+    )
     scale: float = Field(
         default=0.8, ge=0.01, le=10, description="Standard deviation of a surfel over the distance to its neighbours."
     )
@@ -219,6 +224,13 @@ class Settings:
         le=100,
         description="Pixels of a photograph that its mask may be off by: that near its border, what the photograph shows lies "
         "behind the object.",
+    )
+    mask_rim: int | None = Field(
+        default=None,
+        ge=0,
+        le=100,
+        description="Pixels that masks are too large by, which are taken off; unless given, as many as photographs tell by "
+        "where they change.",
     )
     specular_start: float = Field(
         default=0.0, ge=0, le=1, description="Fraction of the fit from which reflections are shaded; 1 means never."

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rgs_mi.core.camera import opaque, pixel_rays
-from rgs_mi.core.learned_camera import INTRINSICS, POSE, learned_camera, lens_reach
+from rgs_mi.core.learned_camera import INTRINSICS, POSE, correction, learned_camera, lens_reach
 from rgs_mi.core.lens import Lens
 
 from captures import distort
@@ -78,6 +78,12 @@ def test_pose_turns_the_scene_about_the_pivot():
     expected = turned + camera.rotation @ (PIVOT - camera.origin) + distance * pose[3:]
     assert np.allclose((points - moved.origin) @ moved.rotation.T, expected, atol=1e-4)
     assert np.allclose(moved.rotation @ moved.rotation.T, np.eye(3), atol=1e-12)
+
+
+def test_a_correction_is_found_again():
+    camera, pose = orbit_camera(2.0, (30, 20)), np.array([0.03, -0.02, 0.05, 0.01, -0.02, 0.03])
+    assert np.allclose(correction(camera, corrected(camera, pose).baked(), PIVOT), pose, atol=1e-6)
+    assert np.allclose(correction(camera, camera, PIVOT), 0, atol=1e-12)
 
 
 def test_intrinsics():

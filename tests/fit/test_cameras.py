@@ -232,6 +232,23 @@ def test_who_learns(dataset):
     assert rows(cameras="learned", exposure="learned") == {POSES, LENSES, EXPOSURE}
 
 
+def test_cameras_begin_elsewhere(dataset):
+    given = [v.camera for v in dataset.train]
+    others = [
+        replace(c, to_world=c.to_world @ Camera.look_at((0.02, 0, 0), (0, 0.03, 1), (0, 1, 0), 50, (8, 8)).to_world)
+        for c in given
+    ]
+    cameras = Cameras(given, 1.0, True, False)
+    cameras.begin(others)
+    assert all(np.allclose(cameras.camera(k).to_world, c.to_world, atol=1e-5) for k, c in enumerate(others))
+    still = cameras.see(2, given[2], SETTINGS.weights, started=False)  # as they begin, and with nothing to learn
+    assert np.allclose(still.camera.baked().to_world, others[2].to_world, atol=1e-5)
+    assert not cameras.gradients()[POSES]
+    fixed = Cameras(given, 1.0, False, True)
+    fixed.begin(others)
+    assert fixed.camera(0) is given[0]
+
+
 def test_exposures_start_where_exif_says(dataset, monkeypatch):
     told = np.linspace(-0.5, 0.5, len(dataset.train))
     monkeypatch.setattr("rgs_mi.fit.cameras.log_gains", lambda paths: told if len(paths) == len(told) else None)

@@ -64,7 +64,7 @@ def test_levels_begin_at_a_square_of_some_220_pixels(dataset, scale, stages):
 
 
 def test_what_is_asked_for_stays(dataset):
-    asked = replace(SETTINGS, density=Density(max_surfels=7), initialization=Initialization(surfels=5))
+    asked = replace(SETTINGS, density=Density(max_surfels=7), initialization=Initialization(surfels=5), mask_rim=2)
     assert planned(asked, dataset) == asked
     few = planned(Settings(density=Density(max_surfels=7)), dataset)
     assert (few.density.max_surfels, few.initialization.surfels) == (7, 7)
@@ -132,3 +132,10 @@ def test_the_last_part_is_finer_if_all_views_have_their_turn(dataset):
     fit._level.seconds.clear()
     fit._level.seconds.append(LAST * 60 / (4 * len(dataset.train)))
     assert fit.stage.downscale == 2, "no time for every view"
+
+
+def test_rims_are_those_of_photographs(dataset, monkeypatch):
+    monkeypatch.setattr("rgs_mi.fit.plan.rim", lambda views: 3 if views is photographed.train else None)
+    photographed = replace(dataset, photographed=True)
+    assert planned(Settings(), photographed).mask_rim == 3 and planned(Settings(), dataset).mask_rim == 0
+    assert planned(Settings(mask_rim=1), photographed).mask_rim == 1
