@@ -188,7 +188,7 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
 
     middle = points[0].mean(0) if box is None else box.center
 
-    def fit_of(shown, settings):
+    def fit_of(shown: Dataset, settings: Settings) -> Fit:
         positions, normals, colors, spacing = points
         shading = _shading(scene, settings, dataset)
         center = shading.turntable.point if shading.turntable else middle  # a room turns about its center

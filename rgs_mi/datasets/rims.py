@@ -44,7 +44,7 @@ def without_rim(view: View, pixels: int) -> View:
     if not pixels or not view.masked:
         return view
     whole = np.pad(view.alpha > 0.5, 1, "edge")  # an object that the frame cuts off goes on beyond it
-    inside = ndimage.distance_transform_edt(whole)[1:-1, 1:-1] - pixels
+    inside = _distance(whole)[1:-1, 1:-1] - pixels
     alpha = np.minimum(view.alpha, np.clip(inside + _HALF, 0, 1))
     if not alpha.any():
         return view
@@ -55,20 +55,28 @@ def without_rim(view: View, pixels: int) -> View:
 
 def _profile(view):
     """[2 `_REACH`]: mean size of the derivative of display values across the mask's border, by distance from it in steps of a
-    pixel, from beside the object inwards; None where the mask has no border."""
+    pixel, from beside the object inwards; None where the mask has no border, or the
+    photograph is too small."""
     mask = view.alpha > 0.5
     if mask.all() or not mask.any():
         return None
     lines = [np.flatnonzero(mask.any(axis)) for axis in (1, 0)]
     window = tuple(slice(max(line[0] - 2 * _REACH, 0), line[-1] + 2 * _REACH) for line in lines)
     mask, pixels = mask[window], view.pixels[window]
-    distance = np.where(mask, ndimage.distance_transform_edt(mask) - 0.5, 0.5 - ndimage.distance_transform_edt(~mask))
-    down, right = np.gradient(ndimage.gaussian_filter(distance, 1))
+    if min(mask.shape) < _REACH:
+        return None
+    distance = np.where(mask, _distance(mask) - 0.5, 0.5 - _distance(~mask))
+    down, right = (np.asarray(part)[..., None] for part in np.gradient(ndimage.gaussian_filter(distance, 1)))
     image = pixels[..., :3].astype(np.float32) / (255 if pixels.dtype == np.uint8 else 1)
     derivative = lambda axis: ndimage.gaussian_filter1d(image, _SIGMA, axis, order=1)
-    across = np.linalg.norm(derivative(0) * down[..., None] + derivative(1) * right[..., None], axis=-1)
-    near = np.abs(distance) < _REACH
+    across = np.sqrt(np.square(derivative(0) * down + derivative(1) * right).sum(-1))
+    near: np.ndarray = np.abs(distance) < _REACH
     near[:3] = near[-3:] = near[:, :3] = near[:, -3:] = False  # where derivatives do not see all around
     place = np.floor(distance[near]).astype(int) + _REACH
-    count, total = (np.bincount(place, weights, 2 * _REACH) for weights in (None, across[near]))
+    count, total = np.bincount(place, minlength=2 * _REACH), np.bincount(place, across[near], 2 * _REACH)
     return total / count if count.all() else None
+
+
+def _distance(mask) -> np.ndarray:
+    """[H, W]: pixels from where a ``mask`` is set to the nearest one where it is not, 0 there."""
+    return np.asarray(ndimage.distance_transform_edt(mask))

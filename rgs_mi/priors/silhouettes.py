@@ -20,6 +20,7 @@ from ..datasets.types import View
 
 _LEAST = 8  # views with silhouettes
 _WIDEST = 2.5  # radians of a wedge: where the other camera stands in front of the object, or nearly, there is none
+_APART = 0.01  # of their distance from the object that two cameras are apart at least, to have a baseline
 _FRAME = 1.0  # pixels: a silhouette that touches the frame so nearly ends there, not where the object does
 _STEPS, _STILL = 20, 1e-4  # of Gauss and Newton's method at most; radians: a step that is shorter is the last
 _PROBE = 1e-5  # radians, of differences
@@ -133,8 +134,8 @@ class _Problem:
         rotation, origin = self.placed(poses)
         count = len(origin)
         last, first = np.zeros((count, count), int), np.zeros((count, count), int)
-        good = ~np.eye(count, dtype=bool)
-        good_last, good_first = good.copy(), good.copy()
+        apart = np.linalg.norm(origin[:, None] - origin, axis=-1) > _APART * self.distance[:, None]
+        good_last, good_first = apart.copy(), apart.copy()
         for k, (rays, on_frame) in enumerate(self.outlines):
             angle = _angles(rays @ rotation[k], *_pencil(origin[k], origin, self.pivot))  # [V, K]
             last[k], first[k] = angle.argmax(1), angle.argmin(1)

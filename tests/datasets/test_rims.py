@@ -43,6 +43,8 @@ def test_what_does_not_tell():
     assert rim([]) == rim([replace(v, masked=False) for v in views]) == 0
     filled = [replace(v, pixels=np.full_like(v.pixels, alpha)) for v in views for alpha in (0, 255)]
     assert rim(filled) == 0
+    tiny = [replace(v, camera=v.camera.cropped(20, 30, 5, 4), pixels=v.pixels[30:34, 20:25]) for v in views]
+    assert rim(tiny) == 0
 
 
 def test_without_it():

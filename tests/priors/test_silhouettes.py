@@ -107,7 +107,14 @@ def test_a_photograph_without_a_silhouette_keeps_its_camera(views):
     assert found.better and found.cameras[3] is given[3].camera and found.cameras[5] is given[5].camera
 
 
+def test_two_photographs_from_one_place_have_no_baseline(views):
+    given = estimated(views)
+    found = agreement([*given, replace(given[2], name="again")])
+    assert found.better and np.median(errors(found.cameras, [*views, views[2]])[0]) < 0.2
+
+
 def test_nothing_to_agree_on(views):
     assert agreement(views[:7]) is None
     assert agreement([replace(v, masked=False) for v in views]) is None
+    assert agreement([replace(views[0], name=str(k)) for k in range(9)]) is None
     assert agreement([replace(v, pixels=np.zeros_like(v.pixels)) for v in views]) is None
