@@ -7,12 +7,17 @@ import pytest
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from rgs_mi.commands.optimize import start
 from rgs_mi.core.alignment import pose_errors
 from rgs_mi.core.camera import Camera
-from rgs_mi.datasets.types import View
+from rgs_mi.datasets.types import Dataset, View
+from rgs_mi.fit.scene import PHOTOGRAPHS, FitScene
 from rgs_mi.priors.silhouettes import agreement
 
+from runs import ROOT
+
 BALLS = [((0.5, 0.1, 0.0), 0.35), ((-0.4, 0.3, 0.2), 0.25), ((-0.1, -0.4, -0.3), 0.3)]
+SCENE = ROOT / "scenes" / "object.xml"
 VIEWS, SIZE, OVERSAMPLING = 24, (240, 200), 4
 
 
@@ -55,6 +60,12 @@ def views():
 def estimated(views, seed=0):
     rng = np.random.default_rng(seed)
     return [replace(v, camera=off(v.camera, rng)) for v in views]
+
+
+def off_surface(fit):
+    """The median distance of a fit's surfels from the balls, where these are all of the hull."""
+    centers = fit.model.numpy("centers")
+    return np.median(np.min([np.abs(np.linalg.norm(centers - c, axis=1) - r) for c, r in BALLS], axis=0))
 
 
 def errors(cameras, views):
@@ -111,6 +122,21 @@ def test_two_photographs_from_one_place_have_no_baseline(views):
     given = estimated(views)
     found = agreement([*given, replace(given[2], name="again")])
     assert found.better and np.median(errors(found.cameras, [*views, views[2]])[0]) < 0.2
+
+
+def test_a_fit_begins_there(views, tmp_path, capsys):
+    """Its hull is that of these cameras, and a step sees photographs from them; without it all is as given."""
+    scene, dataset = FitScene.load(SCENE, tmp_path), Dataset(estimated(views), [], photographed=True)
+    chosen = ["minutes=null", "iterations=9", "initialization.surfels=500", "initialization.compare=false", "light=world"]
+    fit, unmoved = (
+        start(scene, dataset, scene.settings(PHOTOGRAPHS, [*chosen, f"initialization.silhouettes={on}"]), quiet=not on)
+        for on in (True, False)
+    )
+    assert "where silhouettes agree" in capsys.readouterr().out
+    begun, given = ([f.cameras.camera(k) for k in range(VIEWS)] for f in (fit, unmoved))
+    assert np.median(errors(begun, views)[0]) < 0.4 * np.median(errors(given, views)[0])
+    assert off_surface(fit) < 0.6 * off_surface(unmoved)
+    assert fit.step() in (True, False) and np.isfinite(fit.psnr)
 
 
 def test_nothing_to_agree_on(views):
