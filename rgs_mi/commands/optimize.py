@@ -170,9 +170,9 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
         print(seen)
     begin = settings.initialization
     assert begin.surfels, "`planned` gives them"
-    trimmed = [without_rim(view, settings.mask_rim or 0) for view in dataset.train]
+    trimmed = [without_rim(view, settings.mask_rim) for view in dataset.train]
     cameras = _begun_cameras(trimmed, settings, quiet)
-    placed = replace(dataset, train=[replace(view, camera=cameras.get(view.name, view.camera)) for view in trimmed])
+    placed = replace(dataset, train=[replace(view, camera=cameras[view.name]) for view in trimmed])
     points = initial_points(placed, begin.surfels, settings.seed, begin.hull, begin.compare, quiet)
     random = points[1] is None and not (dataset.points is not None and len(dataset.points))
     opacity = begin.opacity or (_ANYWHERE if random else _ON_SURFACE)
@@ -210,7 +210,7 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
         )
         fit = Fit(shown, model, settings, extent, shading, _priors(shown, settings))
         if fit.cameras:
-            fit.cameras.begin([cameras.get(view.name, view.camera) for view in shown.train])
+            fit.cameras.begin([cameras[view.name] for view in shown.train])
         return fit
 
     if settings.light == "auto":
@@ -220,16 +220,17 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
 
 
 def _begun_cameras(views, settings, quiet) -> dict[str, Camera]:
-    """The cameras that training ``views`` begin with where those are not the given ones, by the views' names."""
+    """{name: camera} of training ``views`` as a fit begins with them: as given, or where silhouettes agree."""
+    cameras = {view.name: view.camera for view in views}
     if settings.cameras != "learned" or not settings.initialization.silhouettes:
-        return {}
+        return cameras
     found = agreement(views)
     if found is None or not found.better:
-        return {}
+        return cameras
     if not quiet:
         moved = "poses begin where silhouettes agree"
         print(f"{moved}: of two photographs, to {found.now:.2f} pixels, not {found.given:.1f} as cameras are given")
-    return {view.name: camera for view, camera in zip(views, found.cameras)}
+    return dict(zip(cameras, found.cameras))
 
 
 def _with_surroundings(points, dataset, settings):
@@ -282,10 +283,10 @@ def _resume(saved, scene, dataset, settings, folder) -> Fit:
 
 
 def _gone_on_with(arrays, meta, scene, dataset, settings):
-    settings = planned(settings, dataset)
-    for name in ("box", "light", "turns"):  # what was decided at the start
-        if getattr(settings, name) in (None, "auto") and (value := meta["settings"].get(name)):
+    for name in ("box", "light", "turns", "mask_rim"):  # what was decided at the start
+        if getattr(settings, name) in (None, "auto") and (value := meta["settings"].get(name)) is not None:
             settings = replace(settings, **{name: tuple(value) if isinstance(value, list) else value})
+    settings = planned(settings, dataset)
     if meta["digests"]["photographs"] != dataset.digest:
         raise UserError(f"{dataset.root}: not the photographs of the checkpoint: give its --data, or another --out")
     old, new = _flat(meta["settings"]), _flat(to_dict(settings))

@@ -66,7 +66,7 @@ class Photographs:
         background: float,
         priors: Sequence[DepthPrior] | None = None,
         tolerance: int = 0,
-        rim: int = 0,
+        rim: int | None = None,
     ) -> None:
         self.views, self.downscale, self.background, self.priors = views, downscale, background, priors
         self.tolerance, self.rim = tolerance, rim

@@ -38,9 +38,9 @@ def rim(views: Sequence[View]) -> int:
     return max(round(peaks[0] + vertex - _REACH + 0.5), 0)
 
 
-def without_rim(view: View, pixels: int) -> View:
-    """Return ``view`` with a mask whose border lies so many ``pixels`` farther within; as it is where that leaves nothing, or
-    where it has no mask."""
+def without_rim(view: View, pixels: int | None) -> View:
+    """Return ``view`` with a mask whose border lies so many ``pixels`` farther within; as it is where that leaves nothing,
+    where it has no mask, and for None."""
     if not pixels or not view.masked:
         return view
     whole = np.pad(view.alpha > 0.5, 1, "edge")  # an object that the frame cuts off goes on beyond it
@@ -54,9 +54,8 @@ def without_rim(view: View, pixels: int) -> View:
 
 
 def _profile(view):
-    """[2 `_REACH`]: mean size of the derivative of display values across the mask's border, by distance from it in steps of a
-    pixel, from beside the object inwards; None where the mask has no border, or the
-    photograph is too small."""
+    """[2 `_REACH`]: mean size of the derivative of pixels' values across the mask's border, by distance from it in steps of a
+    pixel, from beside the object inwards; None where the mask has no border, or the photograph is too small."""
     mask = view.alpha > 0.5
     if mask.all() or not mask.any():
         return None

@@ -140,7 +140,7 @@ def _short(settings, light):
 
 def _scores(fit: Fit, views: list[View], turns: Sequence[float | None] = (None,)) -> list[float]:
     """The mean PSNR of ``views`` at the resolution of the fit, for each of ``turns`` of their lamps, degrees (None: its own)."""
-    photographs = Photographs(views, fit.stage.downscale, fit.settings.background, rim=fit.settings.mask_rim or 0)
+    photographs = Photographs(views, fit.stage.downscale, fit.settings.background, rim=fit.settings.mask_rim)
     shown = [photographs.tile(k) for k in range(len(views))]
     scores = []
     with dr.suspend_grad():

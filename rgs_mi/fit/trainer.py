@@ -219,8 +219,9 @@ class Fit:
             self._level = _Level(stage)
         if self.photographs is None or self.photographs.downscale != stage.downscale:
             s = self.settings
-            masks = s.mask_tolerance, s.mask_rim or 0
-            self.photographs = Photographs(self.dataset.train, stage.downscale, s.background, self.priors, *masks)
+            self.photographs = Photographs(
+                self.dataset.train, stage.downscale, s.background, self.priors, s.mask_tolerance, s.mask_rim
+            )
             release_memory()  # of arrays of sizes that do not come again
         self._follow_schedule()
         views = self._next_views(stage.views * self.ranks.size)[self.ranks.rank :: self.ranks.size]

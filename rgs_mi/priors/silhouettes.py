@@ -137,7 +137,8 @@ class _Problem:
         apart = np.linalg.norm(origin[:, None] - origin, axis=-1) > _APART * self.distance[:, None]
         good_last, good_first = apart.copy(), apart.copy()
         for k, (rays, on_frame) in enumerate(self.outlines):
-            angle = _angles(rays @ rotation[k], *_pencil(origin[k], origin, self.pivot))  # [V, K]
+            _, toward, across = _pencil(origin[k], origin[:, None], self.pivot)
+            angle = _angle(rays @ rotation[k], toward, across)  # [V, K]
             last[k], first[k] = angle.argmax(1), angle.argmin(1)
             narrow = np.ptp(angle, axis=1) < _WIDEST
             good_last[k] &= narrow & ~on_frame[last[k]]
@@ -167,18 +168,17 @@ class _Problem:
 
     def step(self, poses, contacts):
         """[V, 6]: Gauss and Newton's next step to the poses that are most likely, with errors of contacts in Cauchy's
-        distribution; without a similarity of the world."""
+        distribution. Of a similarity of the world the prior alone says something: that there is none."""
         residuals = self.residuals(poses, contacts)
-        rows, columns = np.arange(len(residuals)), []
-        data = []
+        columns, data = [], []
         for k in range(6):
             ahead = poses.copy()
             ahead[:, k] += _PROBE
             for member, (p, q) in ((contacts.first, (ahead, poses)), (contacts.second, (poses, ahead))):
                 data.append((self.residuals(p, contacts, q) - residuals) / _PROBE)
                 columns.append(6 * member + k)
-        index = np.tile(rows, len(columns)), np.concatenate(columns)
-        jacobian = sparse.csr_matrix((np.concatenate(data), index), shape=(len(rows), poses.size))
+        index = np.tile(np.arange(len(residuals)), len(columns)), np.concatenate(columns)
+        jacobian = sparse.csr_matrix((np.concatenate(data), index), shape=(len(residuals), poses.size))
         sigma = 1.4826 * np.median(np.abs(residuals)) + 1e-3
         weights = 1 / (1 + (residuals / (_OUTLIER * sigma)) ** 2)
         normal = (jacobian.T @ jacobian.multiply(weights[:, None])).toarray()
@@ -197,11 +197,6 @@ def _pencil(first, second, pivot):
     return baseline, toward, np.cross(baseline, toward)
 
 
-def _angles(rays, _, toward, across):
-    """[V, K]: angles of the planes through ``rays`` [K, 3], in world space, in each of V pencils."""
-    return np.arctan2(across @ rays.T, toward @ rays.T)
-
-
 def _angle(rays, toward, across):
-    """[N]: the same of each ray in its own pencil."""
+    """[...]: angles of the planes through ``rays`` [..., 3], in world space, in their pencils."""
     return np.arctan2(np.sum(rays * across, -1), np.sum(rays * toward, -1))
