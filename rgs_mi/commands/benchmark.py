@@ -5,7 +5,7 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import drjit as dr
@@ -16,6 +16,7 @@ from ..core.camera import Camera
 from ..core.errors import UserError
 from ..fit.scene import FitScene
 from ..fit.trainer import Fit
+from ..settings.settings import Settings
 from ..splat.composite import Layout, composite
 from ..splat.intersect import isect_tiles
 from ..splat.project import project
@@ -29,8 +30,8 @@ _FOV = 39.598  # degrees: 0.6911112 rad, Blender's default camera
 _REPEAT = 5
 
 
-def _milliseconds(call, repeat=_REPEAT) -> float:
-    """Median time of ``call`` after a first one that does not count."""
+def milliseconds(call: Callable[[], object], repeat: int = _REPEAT) -> float:
+    """Return the median time of so many calls, but for the first one."""
     times = []
     for _ in range(repeat):
         dr.sync_thread()
@@ -78,9 +79,9 @@ def splat_times(surfels: Surfels, size: int) -> dict[str, float]:
     dr.eval(projected.geometry, projected.visible, features)
     layout = Layout(camera.size, FEATURES)
     adjoint = mi.Float(rng.normal(size=size * size * layout.pixel).astype(np.float32))
-    times = {"lists": _milliseconds(lambda: isect_tiles(projected, camera.size, layout.cutoffs))}
+    times = {"lists": milliseconds(lambda: isect_tiles(projected, camera.size, layout.cutoffs))}
     lists = isect_tiles(projected, camera.size, layout.cutoffs)
-    times["forward"] = _milliseconds(lambda: dr.eval(composite(projected, features, lists, layout)))
+    times["forward"] = milliseconds(lambda: dr.eval(composite(projected, features, lists, layout)))
 
     inputs = [*projected.geometry, *features]
     seconds = []
@@ -132,13 +133,10 @@ def splat(count: int = 50_000, size: int = 800, against: str | Path | None = Non
 # ---- Step ----
 
 
-def step(
-    path: str | Path, data: str | Path | None, count: int = 15_000, steps: int = 20, overrides: Sequence[str] = ()
-) -> None:
-    """Print the time of a fit's step on one view at full resolution with ``count`` surfels, and the kernels that were
-    compiled after warm-up (which a fit of constant size should not need); and of each of its stages what it takes."""
-    scene = FitScene.load(path, data)
-    settings = scene.settings(
+def steady_settings(scene: FitScene, count: int, overrides: Sequence[str] = ()) -> Settings:
+    """Return the settings of a fit of ``scene`` with ``count`` surfels, of which all steps are alike: one view at full
+    resolution, all harmonics, as many surfels as at first; ``overrides`` come over them."""
+    return scene.settings(
         None,
         [
             f"initialization.surfels={count}",
@@ -149,17 +147,26 @@ def step(
             *overrides,
         ],
     )
+
+
+def step(
+    path: str | Path, data: str | Path | None, count: int = 15_000, steps: int = 20, overrides: Sequence[str] = ()
+) -> None:
+    """Print the time of a fit's step on one view at full resolution with ``count`` surfels, and the kernels that were
+    compiled after warm-up (which a fit of constant size should not need); and of each of its stages what it takes."""
+    scene = FitScene.load(path, data)
+    settings = steady_settings(scene, count, overrides)
     fit: Fit = start(scene, scene.dataset(settings.resolution), settings)
     for _ in range(len(fit.dataset.train)):  # loads each photograph once
         fit.step()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        milliseconds = _milliseconds(fit.step, steps + 1)
+        time_of_step = milliseconds(fit.step, steps + 1)
         kernels = dr.kernel_history((dr.KernelType.JIT,))
     compiled = sum(not k["cache_hit"] or k["cache_disk"] for k in kernels)
     width, height = fit.dataset.train[0].camera.size
     print(
-        f"{len(fit.model)} surfels, {width} x {height} pixels: {milliseconds:.1f} ms a step, "
+        f"{len(fit.model)} surfels, {width} x {height} pixels: {time_of_step:.1f} ms a step, "
         f"{len(kernels) / (steps + 1):.0f} kernels a step, {compiled} compiled after warm-up"
     )
     print(step_profile.table(step_profile.profile(fit.step, steps)))

@@ -99,6 +99,31 @@ def draw(series: dict, x_label: str, y_label: str, lines: dict, marks: dict, low
     return figure
 
 
+def growth_figure(rows: "dict[str, dict[str, np.ndarray]]") -> "Figure":
+    """Return the `matplotlib.figure.Figure` of what `commands.growth` has measured: ``rows`` {name of what grows: {name: its
+    values, name of what that costs: [N]}}, a column of plots each, over which costs are doubly logarithmic."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    costs = {"step_ms": "ms a step", "start_s": "s until the first step", "memory_mb": "MB of memory"}
+    words = {"surfels": "surfels", "side": "pixels of a photograph's side", "views": "photographs"}
+    with rc_context(_STYLE):
+        figure = Figure((3.1 * len(rows), 2.3 * len(costs)), layout="constrained")
+        grid = figure.subplots(len(costs), len(rows), squeeze=False, sharex="col", sharey="row")
+        for column, (name, row) in zip(grid.T, rows.items()):
+            for axes, (cost, label), ink in zip(column, costs.items(), _INKS):
+                axes.loglog(row[name], row[cost], "o-", color=ink, markersize=4)
+                axes.set_title(label if name == next(iter(rows)) else "", loc="left", fontsize=_STYLE["font.size"], pad=8)
+            column[-1].set_xticks(row[name])
+            column[-1].set_xlabel(words[name])
+        for axes, (cost, _) in zip(grid[:, 0], costs.items()):
+            _decades(axes, np.concatenate([row[cost] for row in rows.values()]))
+        for axes in grid.flat:
+            _plain(axes)
+            axes.minorticks_off()
+    return figure
+
+
 def bars(values: Sequence[float], bad: Sequence[bool], x_label: str, y_label: str) -> str:
     """Plot ``values``, one a photograph in their order, as bars from zero, and return an SVG element; those that are ``bad``
     stand out, and what is not finite has no bar."""

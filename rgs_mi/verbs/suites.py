@@ -53,7 +53,7 @@ def _add_workers(parser: Parser):
 def benchmark(parser: Parser) -> Run:
     """Fit and judge a suite of captures beside the paper's tables; or time the splatter, or the step of a fit."""
     commands = parser.add_subparsers(dest="command", required=True, parser_class=Parser)
-    for define in (_suite, _splat, _step):
+    for define in (_suite, _splat, _step, _growth):
         command = commands.add_parser(define.__name__[1:], help=define.__doc__, description=define.__doc__)
         run = define(command)
         add_common(command, quiet=define is _suite)
@@ -117,6 +117,22 @@ def _step(parser: Parser) -> Run:
         from ..commands import benchmark
 
         benchmark.step(scene, data, args.surfels, args.steps, args.overrides)
+
+    return run
+
+
+def _growth(parser: Parser) -> Run:
+    """What start, step and memory come to with more surfels, larger photographs and more of them: half an hour."""
+    parser.add_argument("--scene", default="object", help="what to fit (default: %(default)s)")
+    parser.add_argument("--data", required=True, help="a capture's folder, or one of our targets, which is enlarged")
+    add_out(parser, "runs/growth", "folder of the table and the plot")
+
+    def run(args):
+        scene, data = find_scene(args.scene, "scenes"), find_scene(args.data, "targets")
+        set_variant(args.variant)
+        from ..commands.growth import growth
+
+        growth(scene, data, args.out)
 
     return run
 
