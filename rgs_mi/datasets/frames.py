@@ -27,6 +27,7 @@ _DECODED = 1 << 30  # bytes that photographs may take at their full size while t
 _WORK = 12  # bytes a pixel that reading one takes at its full size: as the file has it, as RGBA, and between; of EXR 4 times that
 _HELD = {False: 4, True: 16}  # bytes a pixel of what is kept: 8 bits, or float
 _CACHE = 8  # bytes a pixel that a fit keeps beside it, in half precision
+MOST_KEPT = 1 << 30  # bytes that it keeps so; images of more photographs are made anew for each step
 
 
 @dataclass(frozen=True)
@@ -209,7 +210,7 @@ def _planned(source, frames, longest) -> tuple[_Budget, list[tuple[int, int]]]:
     remedy = f"give a smaller resolution: --set resolution={max(int(fitting) // 100 * 100, 16)}"
     if kept + work > free:
         raise UserError(f"{what}, and {words(work)} while the largest is read, where {words(free)} are free: {remedy}")
-    if (fitted := kept + _CACHE * sum(areas)) > free:
+    if (fitted := kept + min(_CACHE * sum(areas), MOST_KEPT)) > free:
         warnings.warn(f"{what}, a fit to them up to {words(fitted)}, and {words(free)} are free: {remedy}", stacklevel=5)
     return _Budget(min(_DECODED, max((free - kept) // 2, 1))), sizes
 

@@ -11,6 +11,7 @@ from skimage.transform import downscale_local_mean
 from ..core.arrays import as_float
 from ..core.camera import Camera
 from ..core.color import display
+from .frames import MOST_KEPT
 from .images import resize
 from .rims import without_rim
 from .types import DepthPrior, View
@@ -70,7 +71,7 @@ class Photographs:
     ) -> None:
         self.views, self.downscale, self.background, self.priors = views, downscale, background, priors
         self.tolerance, self.rim = tolerance, rim
-        self._images = {}
+        self._kept, self._bytes = {}, 0
         self._windows = _windows(views, downscale)
 
     @property
@@ -81,42 +82,59 @@ class Photographs:
 
     def tile(self, i: int, turn: int = 0) -> Photograph:
         """Return what a step looks at of view ``i``: its window, or one of the tiles of it, whose ``turn`` it is."""
-        camera, (x, y, *_), window = self.views[i].camera, self._windows[i], self.window
-        if i not in self._images:
-            images, prior = self._images_of(i)
-            cut = lambda image: image[y : y + window[1], x : x + window[0]].transpose(2, 0, 1)
-            # Half precision keeps colours; of depths it would make steps.
-            self._images[i] = cut(images).astype(np.float16), cut(prior).copy(), images.shape[1::-1]
-        images, prior, size = self._images[i]
-        left, top, width, height = _tile(window, turn)
-        flat = lambda planes: [as_float(p.ravel()) for p in planes[:, top : top + height, left : left + width]]
-        planes, depth = flat(images), flat(prior)
+        view, (x, y, *_) = self.views[i], self._windows[i]
+        left, top, width, height = part = _tile(self.window, turn)
+        images, prior = self._planes(i, part)
+        planes, depth = ([as_float(p.ravel()) for p in parts] for parts in (images, prior))
         behind = mi.Color3f(*planes[4:] or [self.background])
+        size = self._size(view)
         return Photograph(
-            camera.resized(*size).cropped(x + left, y + top, width, height),
+            view.camera.resized(*size).cropped(x + left, y + top, width, height),
             mi.Color3f(*planes[:3]) + behind * (1 - planes[3]),
             planes[3],
             behind,
             depth[0] if depth else None,
             bool(self.priors and self.priors[i].inverse),
             size,
-            window,
+            self.window,
         )
 
-    def _images_of(self, i):
-        """Of this level: colour over black, coverage and, where that is no grey level, what lies behind, [H, W, 4 or 7]; and
-        the prior [H, W, 1], or [H, W, 0] where there is none."""
-        view = without_rim(self.views[i], self.rim)
-        images = [display(view.pixels, 0.0), view.alpha[..., None]]
+    def _planes(self, i, part):
+        """Of a ``part`` (x, y, width, height) of the window of view ``i``: colour over black, coverage and, where that is no grey
+        level, what lies behind, [4 or 7, height, width]; and the prior [1, height, width], or [0, …] where there is none."""
+        if i not in self._kept and self._bytes < MOST_KEPT:
+            self._kept[i] = self._made(i, (0, 0, *self.window))
+            self._bytes += sum(planes.nbytes for planes in self._kept[i])
+        if i not in self._kept:
+            return self._made(i, part)
+        left, top, width, height = part
+        return [planes[:, top : top + height, left : left + width] for planes in self._kept[i]]
+
+    def _made(self, i, part):
+        view, (x, y, *_), (left, top, *shape) = without_rim(self.views[i], self.rim), self._windows[i], part
+        size, block = self._size(view), _block(view.camera.size, self.downscale)
+        places = list(zip((y + top, x + left), shape[::-1]))
+        cut = lambda image, scale: image[tuple(slice(scale * low, scale * (low + n)) for low, n in places)]
+        images = [display(cut(view.pixels, block), 0.0), cut(view.alpha, block)[..., None]]
         if self.tolerance and view.masked:
-            opaque = view.pixels.copy()
+            opaque = cut(view.pixels, block).copy()
             opaque[..., 3] = 255 if opaque.dtype == np.uint8 else 1
-            near = _border(view.alpha > 0.5, self.tolerance)[..., None]
+            near = cut(_border(view.alpha > 0.5, self.tolerance), block)[..., None]
             images.append(np.where(near, display(opaque, 0.0), np.float32(self.background)))
-        images = shrink(np.concatenate(images, 2), self.downscale)
-        if self.priors is None:
-            return images, images[..., :0]
-        return images, resize(self.priors[i].values, *images.shape[:2])[..., None]
+        images = shrink(np.concatenate(images, 2), block)
+        prior = images[..., :0] if self.priors is None else cut(resize(self.priors[i].values, *size[::-1]), 1)[..., None]
+        # Half precision keeps colours; of depths it would make steps.
+        return [np.ascontiguousarray(p.transpose(2, 0, 1), kind) for p, kind in ((images, np.float16), (prior, np.float32))]
+
+    def _size(self, view):
+        """(width, height) of a whole photograph of this level."""
+        width, height = (n // _block(view.camera.size, self.downscale) for n in view.camera.size)
+        return width, height
+
+
+def _block(size, downscale):
+    """How many pixels along the side of a photograph of ``size`` make one of a level: as `shrink` has it."""
+    return downscale if min(size) >= downscale else 1
 
 
 def _border(mask, distance):
@@ -127,14 +145,14 @@ def _border(mask, distance):
 
 def _windows(views, downscale):
     """(x, y, width, height) of each view, in pixels of the level: around the mask, of one size where photographs are."""
-    sizes = [tuple(max(n // downscale, 1) if n >= downscale else n for n in v.camera.size) for v in views]
+    sizes = [tuple(n // _block(v.camera.size, downscale) for n in v.camera.size) for v in views]
     if len(set(sizes)) > 1 or not all(v.masked for v in views):
         return [(0, 0, *size) for size in sizes]
     boxes = []
     for view in views:
         rows, columns = (np.flatnonzero((view.pixels[..., 3] > 0).any(axis)) for axis in (1, 0))
         boxes.append([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1])
-    boxes = np.array(boxes) / downscale
+    boxes = np.array(boxes) / _block(views[0].camera.size, downscale)
     wanted = (boxes[:, 2:] - boxes[:, :2]).max(0) + 2 * _CROP_MARGIN
     size = np.minimum(np.ceil(wanted / 8) * 8, sizes[0]).astype(int)
     corners = np.clip(np.round((boxes[:, :2] + boxes[:, 2:] - size) / 2), 0, sizes[0] - size).astype(int)
@@ -162,7 +180,8 @@ def _tile(window, turn):
 def shrink(image: np.ndarray, factor: int) -> np.ndarray:
     """Return an ``image`` [H, W, channels] as means over factor × factor blocks; the last rows and columns that fill no block
     are left out, and an image smaller than a block stays as it is."""
-    if factor == 1 or min(image.shape[:2]) < factor:
+    factor = _block(image.shape[:2], factor)
+    if factor == 1:
         return image
     height, width = (n - n % factor for n in image.shape[:2])
     return downscale_local_mean(image[:height, :width], (factor, factor, 1))

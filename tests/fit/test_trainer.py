@@ -61,6 +61,24 @@ def test_priors_are_cropped_like_photographs(dataset, downscale):
     assert Photographs(dataset.train, downscale, 1.0).tile(2).prior is None
 
 
+@pytest.mark.parametrize("downscale, rim", [(1, None), (1, 2), (2, None)])
+def test_photographs_that_are_not_kept_are_the_same(dataset, monkeypatch, downscale, rim):
+    values = [np.where(v.pixels[..., 3] > 127, v.pixels[..., 3] / 255, np.nan).astype(np.float32) for v in dataset.train]
+    of = lambda: Photographs(dataset.train, downscale, 1.0, [DepthPrior(v) for v in values], tolerance=3, rim=rim)
+    monkeypatch.setattr("rgs_mi.datasets.photographs.MOST_PIXELS", 600)  # several tiles
+    kept, made = of(), of()
+    turns = [(view, turn) for view in range(3) for turn in range(2)]
+    tiles = [kept.tile(view, turn) for view, turn in turns]
+    monkeypatch.setattr("rgs_mi.datasets.photographs.MOST_KEPT", 0)
+    for photo, (view, turn) in zip(tiles, turns):
+        again = made.tile(view, turn)
+        assert again.camera.principal == photo.camera.principal and 0 < photo.part < 1
+        for name in ("color", "alpha", "behind", "prior"):
+            np.testing.assert_array_equal(np.array(getattr(again, name)), np.array(getattr(photo, name)))
+    assert len(kept._kept) == 3 and not made._kept
+    assert sum(photo.alpha.numpy().sum() for photo in tiles) > 100
+
+
 def test_masks_that_may_be_wrong_show_what_lies_behind(dataset):
     """Near their borders the photograph itself; farther away what is opaque, or the background."""
     view = dataset.train[1]
