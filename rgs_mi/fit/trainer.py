@@ -23,7 +23,7 @@ from .curves import Curves
 from .density import DensityControl, Gradients
 from .model import ENVIRONMENT, Model
 from .objective import CUTOFFS, Objective
-from .plan import LAST, LEAST_STEPS, STEPS
+from .plan import COST, LAST, LEAST_STEPS, OFTEN, STEPS
 from .ranks import Ranks
 from .schedule import Schedule
 from .turns import Turns
@@ -130,19 +130,20 @@ class Fit:
     @property
     def stage(self) -> Stage:
         """The level of the pyramid in use: that of the schedule; in a fit that minutes bound, level by level, each after
-        `STEPS` of the one before, and if there is time for `LEAST_STEPS` or, in its last part (`LAST`), for every view once."""
+        `STEPS` of the one before, and if there is time for `LEAST_STEPS` or, at full resolution, for every view as `OFTEN`."""
         planned, now, s = self.schedule.stage(self.progress), self._level, self.settings
         if now is None or s.iterations or s.minutes is None or planned.downscale >= now.stage.downscale:
             return planned
         if self.photographs is None or not now.seconds:
             return now.stage
         finer = max((stage for stage in s.stages or () if stage.downscale < now.stage.downscale), key=lambda x: x.downscale)
-        scale = now.stage.downscale / finer.downscale
+        scale, full = now.stage.downscale / finer.downscale, finer.downscale == 1
         width, height = self.photographs.window
         tiles = [np.prod(tiling((round(width * f), round(height * f)))) for f in (1, scale)]  # of a view, now and then
-        seconds = scale**2 * tiles[0] / tiles[1] * finer.views / now.stage.views * np.median(now.seconds)
-        full = finer.downscale == 1  # which costs most, and shows least
-        least = LEAST_STEPS[full] if self.progress <= 1 - LAST else len(self.dataset.train) * tiles[1] / finer.views
+        pixels = scale**2 * tiles[0] / tiles[1] * finer.views / now.stage.views
+        seconds = pixels**COST * np.median(now.seconds)
+        each = len(self.dataset.train) * tiles[1] / finer.views  # steps that see every view once
+        least = OFTEN[self.progress > 1 - LAST] * each if full else LEAST_STEPS
         affordable = 60 * s.minutes - self.elapsed > least * seconds
         return finer if affordable and now.steps >= STEPS[full] else now.stage
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rgs_mi.fit.plan import LAST, LEAST_STEPS, STEPS, agree, planned, told
+from rgs_mi.fit.plan import COST, LAST, LEAST_STEPS, OFTEN, STEPS, agree, planned, told
 from rgs_mi.fit.trainer import Fit
 from rgs_mi.settings.config import to_dict
 from rgs_mi.settings.settings import Density, Initialization, Settings, Stage
@@ -103,16 +103,16 @@ def test_levels_wait_for_steps_and_time(dataset, monkeypatch):
     level = fit._level
     level.steps = STEPS[0]
     level.seconds.clear()
-    level.seconds.append(47.0 / LEAST_STEPS[0] / 4.1)  # the next takes four times as long
+    level.seconds.append(47.0 / LEAST_STEPS / 4**COST / 1.02)  # the next has four times the pixels
     assert fit.stage.downscale == 2
     level.seconds.clear()
-    level.seconds.append(47.0 / LEAST_STEPS[0] / 3.9)
+    level.seconds.append(47.0 / LEAST_STEPS / 4**COST / 0.98)
     assert fit.stage.downscale == 4, "no time for it"
     width, height = fit.photographs.window
     monkeypatch.setattr("rgs_mi.datasets.photographs.MOST_PIXELS", width * height)
     assert fit.stage.downscale == 2, "four tiles: steps take no longer"
     level.seconds.clear()
-    level.seconds.append(47.0 / LEAST_STEPS[0] * 1.1)
+    level.seconds.append(47.0 / LEAST_STEPS * 1.1)
     assert fit.stage.downscale == 4, "no time for it"
 
 
@@ -120,18 +120,24 @@ def test_the_last_part_is_finer_if_all_views_have_their_turn(dataset):
     stages = (Stage(0.1, 2, 1), Stage(1.0, 1, 1))
     fit = Fit(dataset, model(), replace(SETTINGS, iterations=None, minutes=1.0, stages=stages), 1.0)
     fit.step()
-    fit._level.seconds.clear()
-    fit._level.seconds.append(0.1)
-    fit.elapsed = 60 * (1 - LAST) + 1
+    second = lambda often, time: time / (often * len(dataset.train)) / 4**COST  # of a step, to see all so often in that time
+
+    def at(elapsed, seconds):
+        fit.elapsed = elapsed
+        fit._level.seconds.clear()
+        fit._level.seconds.append(seconds)
+
+    late, early = 60 * (1 - LAST) + 1, 60 * (1 - LAST) - 1
+    at(late, second(1, 14) / 1.02)
     assert fit.stage.downscale == 2, "too few steps"
     fit._level.steps = STEPS[1]
     assert fit.stage.downscale == 1
-    fit.elapsed = 60 * (1 - LAST) - 1
-    assert fit.stage.downscale == 2, "no time for 1000 of them"
-    fit.elapsed = 60 * (1 - LAST) + 1
-    fit._level.seconds.clear()
-    fit._level.seconds.append(LAST * 60 / (4 * len(dataset.train)))
+    at(late, second(1, 14) / 0.98)
     assert fit.stage.downscale == 2, "no time for every view"
+    at(early, second(OFTEN[0], 16) / 0.98)
+    assert fit.stage.downscale == 2, "no time for every view six times"
+    at(early, second(OFTEN[0], 16) / 1.02)
+    assert fit.stage.downscale == 1
 
 
 def test_rims_are_those_of_photographs(dataset, monkeypatch):
