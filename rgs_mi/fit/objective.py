@@ -97,11 +97,12 @@ class Objective:
             terms["depth"] = w.depth * losses.pearson_depth(depth, photo.prior, covered, photo.inverse)
         return terms, mask
 
-    def residual(self, surfels: Surfels, lighting: Lighting, camera: Camera) -> "mi.Float":
+    def residual(self, surfels: Surfels, lighting: Lighting, camera: Camera, radiance_yields: bool) -> "mi.Float":
         """Return the weighted part of the ``surfels``' diffuse radiance, as ``camera`` sees them, that is not what their base
-        color reflects under ``lighting``; of width 1. It has gradients in that radiance, base color and metallic alone: the light
-        is what reflections say that it is."""
-        held = {name: dr.detach(getattr(surfels, name)) for name in CHANNELS if name not in ("sh", "base_color", "metallic")}
+        color reflects under ``lighting``; of width 1. It has gradients in base color and metallic and, where the
+        ``radiance_yields``, in that; none in the light, which is what reflections say that it is."""
+        moved = ("base_color", "metallic", *(["sh"] if radiance_yields else []))
+        held = {name: dr.detach(getattr(surfels, name)) for name in CHANNELS if name not in moved}
         surfels = replace(surfels, **held).split()
         lighting = lighting.with_learned([dr.detach(v) for v in lighting.learned()], surfels)
         center = surfels.column(mi.Point3f, "centers")

@@ -133,7 +133,7 @@ class Weights:
         description="Total variation of the environment: what nothing reflects sharply stays smooth.",
     )
     residual: float = Field(
-        default=0.1,
+        default=0.2,
         ge=0,
         le=1e3,
         description="Diffuse radiance that the base color does not explain, where the integrator's `diffuse` is `relightable`.",

@@ -103,10 +103,10 @@ def test_the_residual_and_its_gradient():
     camera, objective = orbit_camera(0.4, size=(72, 64)), Objective(SETTINGS, 1.0)
     weight = SETTINGS.weights.residual
 
-    def loss(colors):
+    def loss(colors, radiance_yields=True):
         changed = replace(surfels, base_color=mi.TensorXf(np.float32(colors)))
         dr.enable_grad(changed.base_color)
-        value = objective.residual(changed, lighting, camera)
+        value = objective.residual(changed, lighting, camera, radiance_yields)
         dr.backward(value)
         return float(value[0]), dr.grad(changed.base_color).numpy()
 
@@ -118,7 +118,11 @@ def test_the_residual_and_its_gradient():
     texels = lighting.estimator.environment.texels
     held = texels, surfels.centers, surfels.rotations, surfels.roughness
     dr.enable_grad(held)
+    dr.enable_grad(surfels.sh)
+    loss(colors, radiance_yields=False)
+    assert not dr.grad(surfels.sh).numpy().any()
     loss(colors)
+    assert dr.grad(surfels.sh).numpy().any()
     assert not any(dr.grad(v).numpy().any() for v in held)  # it moves no light
     assert value > 0.05 * weight and abs((gradient * step).sum() / difference - 1) < 0.03
     assert abs(gradient[facing]).max() > 0 and (gradient[(surfels.numpy()["centers"] @ camera.origin) < 0.9] == 0).all()
