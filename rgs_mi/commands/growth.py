@@ -103,7 +103,7 @@ def enlarged(dataset: Dataset, side: int, views: int) -> Dataset:
 
 def _of_side(view: View, side: int) -> View:
     width, height = (round(n * side / max(view.camera.size)) for n in view.camera.size)
-    pixels = resize(view.pixels, (height, width), order=1, preserve_range=True).astype(view.pixels.dtype)
+    pixels = np.asarray(resize(view.pixels, (height, width), order=1, preserve_range=True), view.pixels.dtype)
     return replace(view, camera=view.camera.resized(width, height), pixels=pixels, normal=None)
 
 
