@@ -1,5 +1,5 @@
-"""How a fit grows with surfels, pixels and photographs: what its start, a step and its memory come to. What `rgs-mi benchmark
-growth` calls.
+"""How a fit grows with surfels, pixels and photographs: what its start, a step and its memory come to. What
+`rgs-mi benchmark growth` calls.
 
     OUT/growth.csv    a row a measurement; written after each
     OUT/growth.png    the same as curves
