@@ -259,9 +259,9 @@ def test_memory_is_planned_before_anything_is_decoded(large, monkeypatch):
 
 
 def test_memory_of_a_fit_is_told(large, monkeypatch):
-    monkeypatch.setattr(frames, "available", lambda: 3 << 30)
+    monkeypatch.setattr(frames, "available", lambda: 2 << 30)
     monkeypatch.setattr(frames, "_load_view", lambda *_, **__: pytest.fail("planned"))
-    with pytest.warns(UserWarning, match=r"a fit to them up to 4\.9 GB, and 3\.2 GB are free: give a smaller resolution"):
+    with pytest.warns(UserWarning, match=r"a fit to them up to 2\.7 GB, and 2\.1 GB are free: give a smaller resolution"):
         with pytest.raises(pytest.fail.Exception, match="planned"):
             load_dataset(large)
 
