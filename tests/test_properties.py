@@ -249,7 +249,7 @@ REAL = st.floats(-1, 1)
 VECTORS = st.tuples(REAL, REAL, REAL).map(np.array)
 
 
-@settings(SHORT, max_examples=8)
+@settings(SHORT, max_examples=15)
 @given(VECTORS, VECTORS, st.floats(-3, 6))
 def test_starts_go_with_the_world(dataset, turn, shift, magnitude):
     """A capture that is turned, moved and scaled has its first surfels where they were, but for the hull's grid, whose axes

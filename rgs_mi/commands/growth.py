@@ -8,6 +8,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -114,7 +115,7 @@ def _all_loads() -> list[Load]:
 
 def _row(costs: dict[Load, Cost], name: str, base: Load) -> dict[str, np.ndarray]:
     """What grows with the part ``name`` of a load alone, from ``base``: {name: its values, field of a cost: [N]}."""
-    along = lambda load: replace(load, **{name: getattr(base, name)}) == base
-    alike = sorted(((getattr(load, name), load) for load in costs if along(load)), key=lambda pair: pair[0])
-    numbers = {field.name: [getattr(costs[load], field.name) for _, load in alike] for field in fields(Cost)}
-    return {name: np.array([n for n, _ in alike])} | {cost: np.array(values, float) for cost, values in numbers.items()}
+    along = [load for load in costs if replace(load, **{name: getattr(base, name)}) == base]
+    along.sort(key=attrgetter(name))
+    column = lambda field: np.array([getattr(costs[load], field.name) for load in along], float)
+    return {name: np.array([getattr(load, name) for load in along])} | {f.name: column(f) for f in fields(Cost)}

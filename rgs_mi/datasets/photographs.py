@@ -71,7 +71,7 @@ class Photographs:
     ) -> None:
         self.views, self.downscale, self.background, self.priors = views, downscale, background, priors
         self.tolerance, self.rim = tolerance, rim
-        self._kept, self._bytes = {}, 0
+        self._kept: dict[int, list[np.ndarray]] = {}
         self._windows = _windows(views, downscale)
 
     @property
@@ -102,11 +102,10 @@ class Photographs:
     def _planes(self, i, part):
         """Of a ``part`` (x, y, width, height) of the window of view ``i``: colour over black, coverage and, where that is no grey
         level, what lies behind, [4 or 7, height, width]; and the prior [1, height, width], or [0, …] where there is none."""
-        if i not in self._kept and self._bytes < MOST_KEPT:
-            self._kept[i] = self._made(i, (0, 0, *self.window))
-            self._bytes += sum(planes.nbytes for planes in self._kept[i])
         if i not in self._kept:
-            return self._made(i, part)
+            if sum(planes.nbytes for kept in self._kept.values() for planes in kept) >= MOST_KEPT:
+                return self._made(i, part)
+            self._kept[i] = self._made(i, (0, 0, *self.window))
         left, top, width, height = part
         return [planes[:, top : top + height, left : left + width] for planes in self._kept[i]]
 

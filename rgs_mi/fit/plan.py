@@ -16,9 +16,9 @@ _MOST_UNMASKED = 250_000  # more need time that each is then seen too rarely in,
 _FIRST = 25_000  # surfels to start with, at least
 _COARSEST, _FINEST_FROM = 220, 0.2  # side of a square of as many pixels, about; the part of the fit before full resolution
 STEPS = 500, 1000  # of a level before the next: of one below half resolution, and of that
-LAST = 0.25  # of the fit: there half as fine is not fine enough
+LAST = 0.25  # of the fit: there half as fine is not fine enough, if every view can be seen once more
 LEAST_STEPS = 250  # that there must be time for at the next, up to half resolution
-OFTEN = 6, 1  # times that there must be time to see every photograph at full resolution, and in the last part
+OFTEN = 6  # times that there must be time to see every view at full resolution
 COST = 0.65  # a step on so many times as many pixels takes that to this power as long: surfels cost, too
 _OPEN = (
     "max_surfels",

@@ -130,7 +130,8 @@ class Fit:
     @property
     def stage(self) -> Stage:
         """The level of the pyramid in use: that of the schedule; in a fit that minutes bound, level by level, each after
-        `STEPS` of the one before, and if there is time for `LEAST_STEPS` or, at full resolution, for every view as `OFTEN`."""
+        `STEPS` of the one before, and if there is time for `LEAST_STEPS` or, at full resolution, for every view `OFTEN`; in its
+        last part (`LAST`), for every view once."""
         planned, now, s = self.schedule.stage(self.progress), self._level, self.settings
         if now is None or s.iterations or s.minutes is None or planned.downscale >= now.stage.downscale:
             return planned
@@ -140,10 +141,10 @@ class Fit:
         scale, full = now.stage.downscale / finer.downscale, finer.downscale == 1
         width, height = self.photographs.window
         tiles = [np.prod(tiling((round(width * f), round(height * f)))) for f in (1, scale)]  # of a view, now and then
-        pixels = scale**2 * tiles[0] / tiles[1] * finer.views / now.stage.views
-        seconds = pixels**COST * np.median(now.seconds)
-        each = len(self.dataset.train) * tiles[1] / finer.views  # steps that see every view once
-        least = OFTEN[self.progress > 1 - LAST] * each if full else LEAST_STEPS
+        pixels = scale**2 * tiles[0] / tiles[1]  # of a view in a step, over those now
+        seconds = pixels**COST * finer.views / now.stage.views * np.median(now.seconds)
+        once = len(self.dataset.train) * tiles[1] / finer.views  # steps that see every view
+        least = once if self.progress > 1 - LAST else OFTEN * once if full else LEAST_STEPS
         affordable = 60 * s.minutes - self.elapsed > least * seconds
         return finer if affordable and now.steps >= STEPS[full] else now.stage
 

@@ -51,7 +51,8 @@ def _add_workers(parser: Parser):
 
 
 def benchmark(parser: Parser) -> Run:
-    """Fit and judge a suite of captures beside the paper's tables; or time the splatter, or the step of a fit."""
+    """Fit and judge a suite of captures beside the paper's tables; or time the splatter, or the step of a fit; or
+    measure how a fit grows."""
     commands = parser.add_subparsers(dest="command", required=True, parser_class=Parser)
     for define in (_suite, _splat, _step, _growth):
         command = commands.add_parser(define.__name__[1:], help=define.__doc__, description=define.__doc__)

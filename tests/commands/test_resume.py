@@ -55,7 +55,7 @@ def finish(process):
 
 @pytest.mark.slow
 def test_killed_and_resumed(tmp_path):
-    whole, killed, hits = kill_and_resume(tmp_path, kills=2)
+    whole, killed, hits = kill_and_resume(tmp_path, kills=3)
     assert hits > 0
     assert abs(whole - killed) < TOLERANCE
 

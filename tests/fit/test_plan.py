@@ -114,6 +114,8 @@ def test_levels_wait_for_steps_and_time(dataset, monkeypatch):
     level.seconds.clear()
     level.seconds.append(47.0 / LEAST_STEPS * 1.1)
     assert fit.stage.downscale == 4, "no time for it"
+    fit.elapsed = 60 * (1 - LAST) + 1
+    assert fit.stage.downscale == 2, "time for every view, in the last part"
 
 
 def test_the_last_part_is_finer_if_all_views_have_their_turn(dataset):
@@ -134,9 +136,9 @@ def test_the_last_part_is_finer_if_all_views_have_their_turn(dataset):
     assert fit.stage.downscale == 1
     at(late, second(1, 14) / 0.98)
     assert fit.stage.downscale == 2, "no time for every view"
-    at(early, second(OFTEN[0], 16) / 0.98)
+    at(early, second(OFTEN, 16) / 0.98)
     assert fit.stage.downscale == 2, "no time for every view six times"
-    at(early, second(OFTEN[0], 16) / 1.02)
+    at(early, second(OFTEN, 16) / 1.02)
     assert fit.stage.downscale == 1
 
 
