@@ -3,9 +3,10 @@
 #
 #     scripts/gpu_check.sh [OUT]        (default: runs/gpu_check)
 #
-# Installs the clone, from the folder `wheels` where there is one, which needs no network (`pip download -c constraints.txt -d wheels
-# '.[test]' setuptools wheel` fills it), runs the tests of kernels, both benchmarks and two minutes of the helmet in
-# `cuda_ad_rgb`, or in the variant that RGS_MI_VARIANT names, and ends with 1 where one of them fails. OUT has what they print.
+# Installs the clone beside what the machine's Python has, from the folder `wheels` where there is one, which needs no network
+# (`pip download -d wheels . pytest pytest-xdist setuptools wheel` fills it), runs the tests of kernels, both benchmarks and two
+# minutes of the helmet in `cuda_ad_rgb`, or in the variant that RGS_MI_VARIANT names, and ends with 1 where one of them fails.
+# OUT has what they print.
 set -uo pipefail
 cd "$(dirname "$0")/.."
 export RGS_MI_VARIANT=${RGS_MI_VARIANT:-cuda_ad_rgb}
@@ -26,9 +27,9 @@ stage() {
 offline=""
 [ -d wheels ] && offline="--no-index --find-links wheels"
 venv=$out/venv
-stage install 150 . bash -c "python3 -m venv '$venv' && '$venv'/bin/pip install --quiet $offline -c constraints.txt -e '.[test]'"
+stage install 150 . bash -c "python3 -m venv --system-site-packages '$venv' && '$venv'/bin/pip install --quiet $offline -e . pytest pytest-xdist"
 nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv,noheader 2>/dev/null
-stage tests 180 'passed|failed' "$venv"/bin/pytest -q -x tests/splat tests/shading/test_split_sum.py tests/fit/test_losses.py \
+stage tests 180 'passed|failed' "$venv"/bin/python -m pytest -q -n 8 --dist worksteal -o filterwarnings= tests/splat tests/shading/test_split_sum.py tests/fit/test_losses.py \
     tests/fit/test_density.py tests/fit/test_trainer.py
 stage splat 60 '^total' "$venv"/bin/python scripts/benchmark.py splat --variant "$RGS_MI_VARIANT"
 stage step 90 'ms a step' "$venv"/bin/python scripts/benchmark.py step --data ball --variant "$RGS_MI_VARIANT"
