@@ -89,11 +89,12 @@ class SurfelPathIntegrator(mi.SamplingIntegrator):
         prev_si, prev_pdf, prev_delta = dr.zeros(mi.Interaction3f), mi.Float(1), mi.Bool(True)
         left_surfel, active = mi.Bool(False), mi.Bool(active)
 
-        while active:
+        while dr.hint(active, mode="evaluated" if _apart() else None):
             # ---- What the ray meets: a surfel, or a shape behind those that it passed ----
-            pi = scene.ray_intersect_preliminary(ray, active=active)
+            pi = _traced(scene.ray_intersect_preliminary(ray, active=active))
             maxt = dr.select(pi.is_valid(), pi.t, dr.largest(mi.Float))
-            hit = surfel_rays.intersect(ray, dr.minimum(maxt, ray.maxt), left_surfel, sampler.next_1d(active), active)
+            maxt = dr.minimum(maxt, ray.maxt)
+            hit = _traced(surfel_rays.intersect(ray, maxt, left_surfel, sampler.next_1d(active), active))
             on_surfel = active & hit.found
             active_shape = active & ~on_surfel
             si = pi.compute_surface_interaction(ray, mi.RayFlags.All, active_shape)
@@ -122,8 +123,8 @@ class SurfelPathIntegrator(mi.SamplingIntegrator):
             shadow.o = dr.select(on_surfel, surfel_rays.above(si.p, si.n), shadow.o)
             shadow.d = ds.d
             shadow.maxt = ds.dist * _SHADOW
-            active_em &= ~scene.ray_test(shadow, active_em)
-            visible = surfel_rays.transmittance(shadow, shadow.maxt, on_surfel, active_em)
+            active_em &= ~_traced(scene.ray_test(shadow, active_em))
+            visible = _traced(surfel_rays.transmittance(shadow, shadow.maxt, on_surfel, active_em))
             wo = si.to_local(ds.d)
             value, pdf = bsdf.eval_pdf(context, si, wo, active_em & ~on_surfel)
             value = dr.select(on_surfel, lobe.eval(si, wo), value)
@@ -157,6 +158,19 @@ class SurfelPathIntegrator(mi.SamplingIntegrator):
 
     def to_string(self) -> str:
         return f"SurfelPathIntegrator[diffuse = {self.diffuse}]"
+
+
+def _apart():
+    """Whether rays through the scene and rays through its surfels, which are a scene of their own, need kernels of their own:
+    OptiX knows one scene in each, and lets rays through another meet nothing."""
+    return dr.backend_v(mi.Float) == dr.JitBackend.CUDA
+
+
+def _traced(found):
+    """What a ray tracer ``found``, with the end of a kernel where that needs one."""
+    if _apart():
+        dr.eval(found)
+    return found
 
 
 def _interaction(ray, hit):

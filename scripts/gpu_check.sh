@@ -27,10 +27,12 @@ stage() {
 offline=""
 [ -d wheels ] && offline="--no-index --find-links wheels"
 venv=$out/venv
-stage install 150 . bash -c "python3 -m venv --system-site-packages '$venv' && '$venv'/bin/pip install --quiet $offline -e . pytest pytest-xdist"
+stage install 150 . bash -c "python3 -m venv '$venv' \
+    && python3 -c 'import sys; print(*(p for p in sys.path if \"-packages\" in p), sep=chr(10))' >\$(echo '$venv'/lib/python3*/site-packages)/machine.pth \
+    && '$venv'/bin/python -m pip install --quiet $offline -e . pytest pytest-xdist"
 nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv,noheader 2>/dev/null
-stage tests 180 'passed|failed' "$venv"/bin/python -m pytest -q -n 8 --dist worksteal -o filterwarnings= tests/splat tests/shading/test_split_sum.py tests/fit/test_losses.py \
-    tests/fit/test_density.py tests/fit/test_trainer.py
+stage tests 180 'passed|failed' "$venv"/bin/python -m pytest -q -n 8 --dist worksteal -o filterwarnings= tests/splat \
+    tests/shading/test_split_sum.py tests/fit/test_losses.py tests/fit/test_density.py tests/fit/test_trainer.py
 stage splat 60 '^total' "$venv"/bin/python scripts/benchmark.py splat --variant "$RGS_MI_VARIANT"
 stage step 90 'ms a step' "$venv"/bin/python scripts/benchmark.py step --data ball --variant "$RGS_MI_VARIANT"
 stage helmet 300 '^PSNR' "$venv"/bin/python scripts/optimize.py scenes/helmet.xml --minutes 2 --out "$out/helmet" --variant "$RGS_MI_VARIANT" --quiet

@@ -1,7 +1,9 @@
 """Surfels in a path-traced scene: crossings against brute force, pictures against Mitsuba's path tracer by statistics."""
 
+import importlib
 from dataclasses import replace
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -201,6 +203,23 @@ def test_emitters_hide_and_coverage_is_alpha():
     assert (shown[..., 3] == 1).all() and hidden[0, 0, 3] == 0 and (hidden[0, 0, :3] == 0).all()
     splatted = picture("rgs_deferred", specular="none", hide_emitters=True)
     assert abs(hidden[..., 3] - splatted[..., 3]).mean() < 0.02  # whose low-pass widens small surfels
+
+
+def test_kernels_of_their_own_change_nothing(monkeypatch):
+    """As OptiX needs them, which traces rays through one scene in a kernel."""
+    scene = mi.load_dict({"type": "scene"} | shapes() | {"object": surfel_shape(sphere_surfels(300))})
+    sensor = mi.load_dict(Camera.look_at([0, -7, 4], [0, 0, 0.6], [0, 0, 1], 45, (28, 20)).to_sensor_dict())
+    rgs_path = importlib.import_module("rgs_mi.plugins.rgs_path")  # which needs a variant
+    pictures, kernels = [], []
+    for apart in (False, True):
+        monkeypatch.setattr(rgs_path, "_apart", lambda: apart)
+        integrator = mi.load_dict({"type": "rgs_path", "diffuse": "lit", "max_depth": 4})
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            pictures.append(mi.render(scene, sensor=sensor, integrator=integrator, spp=16).numpy())
+            kernels.append(len(dr.kernel_history((dr.KernelType.JIT,))))
+    np.testing.assert_allclose(*pictures, rtol=1e-4, atol=1e-5)
+    assert kernels[1] > kernels[0] + 8
 
 
 @pytest.mark.parametrize(

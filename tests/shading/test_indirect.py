@@ -285,10 +285,10 @@ def test_share_of_diffuse_light_under_a_disc(two_sided):
         [light.with_irradiance_visibility(seed).indirect.irradiance_visibility.numpy()[:, 0] for seed in range(40)], 0
     )
     radius, height = 0.4 + 0.02, 0.5 - 0.02  # quads reach nearly two standard deviations; rays start as far above
-    below = irradiance_visibility[0] == 1  # where a surfel that shows from behind is hidden by nothing
-    assert (
-        below if two_sided else irradiance_visibility[0] == pytest.approx(1 - radius**2 / (radius**2 + height**2), abs=0.01)
-    )
+    share = (
+        1 if two_sided else 1 - radius**2 / (radius**2 + height**2)
+    )  # 1: where what shows from behind is hidden by nothing
+    assert irradiance_visibility[0] == pytest.approx(share, abs=1e-6 if two_sided else 0.01)
 
 
 @pytest.mark.parametrize("kind", ["visibility", "one_bounce"])

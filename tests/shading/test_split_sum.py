@@ -97,7 +97,12 @@ def test_environment_equals_the_envmap_emitter():
     d = vector(np.concatenate([unit(rng, 4000), environment.rotation.T[[0, 2]], -environment.rotation.T[[0, 2]]]))
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(d))
     si.wi = -d
-    assert np.allclose(environment.filtered().eval(d).numpy(), emitter.eval(si).numpy(), atol=2e-4)
+    assert np.allclose(environment.filtered().eval(d).numpy(), emitter.eval(si).numpy(), atol=texture_error())
+
+
+def texture_error():
+    """Of what Mitsuba interpolates between texels of [0, 1]: a GPU's texture units do it with eight bits."""
+    return 2e-4 if mi.variant().startswith("llvm") else 2**-8
 
 
 def test_a_finer_environment_is_the_same():
@@ -110,7 +115,7 @@ def test_a_finer_environment_is_the_same():
     si = dr.zeros(mi.SurfaceInteraction3f, d.size // 3)
     si.wi = -vector(d.reshape(-1, 3))
     shown = mi.load_dict({"type": "envmap", "bitmap": mi.Bitmap(texels)}).eval(si).numpy().T
-    np.testing.assert_allclose(finer[1:-1], shown.reshape(d.shape), atol=2e-4)
+    np.testing.assert_allclose(finer[1:-1], shown.reshape(d.shape), atol=texture_error())
 
 
 @pytest.mark.parametrize("entry", [5, 15, 24])
