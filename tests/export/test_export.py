@@ -8,6 +8,7 @@ import struct
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import VARIANT
 
 import rgs_mi
 from rgs_mi.commands.export import FORMATS, export
@@ -44,7 +45,7 @@ def make_run(folder):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    rgs_mi.set_variant("llvm_ad_rgb")
+    rgs_mi.set_variant(VARIANT)
     return make_run(tmp_path_factory.mktemp("runs") / "ball")
 
 

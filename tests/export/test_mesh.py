@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import VARIANT
 from scipy.spatial import KDTree
 
 import rgs_mi
@@ -87,7 +88,7 @@ VOXEL = 0.05
 
 @pytest.fixture(scope="module")
 def sphere():
-    rgs_mi.set_variant("llvm_ad_rgb")
+    rgs_mi.set_variant(VARIANT)
     views = cameras()
     depths = [sphere_depth(camera) for camera in views]
     return views, depths, tsdf.fuse(views, [as_float(d) for d in depths], voxel=VOXEL)
@@ -246,7 +247,7 @@ def exported(request, tmp_path_factory):
     """(the run's folder, that of its mesh)."""
     for name in ("fast_simplification", "xatlas"):
         pytest.importorskip(name, reason="needs pip install 'rgs-mi[mesh]'")
-    rgs_mi.set_variant("llvm_ad_rgb")
+    rgs_mi.set_variant(VARIANT)
     run = make_run(tmp_path_factory.mktemp("runs") / "ball", request.param)
     export(run, "mesh", quiet=True)
     return run, run / "export" / "mesh"

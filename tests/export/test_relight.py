@@ -5,6 +5,7 @@ import json
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import VARIANT
 
 import rgs_mi
 from rgs_mi.commands.recovery import hidden, recovery, true_maps
@@ -30,7 +31,7 @@ SETTINGS = [
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory):
-    rgs_mi.set_variant("llvm_ad_rgb")
+    rgs_mi.set_variant(VARIANT)
     return make_inputs(tmp_path_factory.mktemp("inputs"), size=40)
 
 

@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import VARIANT
 
 import rgs_mi
 from rgs_mi.core.errors import UserError
@@ -442,7 +443,7 @@ def backward_gradients(scene):
 @pytest.fixture(scope="module")
 def smooth():
     """A smooth scene with all AOVs, and its gradients."""
-    rgs_mi.set_variant("llvm_ad_rgb")
+    rgs_mi.set_variant(VARIANT)
     scene = smooth_scene(pixel_format="rgba", integrator={"aovs": ALL_AOVS}, texels=smooth_environment(64))
     return scene, backward_gradients(scene)
 
@@ -469,7 +470,8 @@ def test_backward_equals_finite_differences(key, smooth):
     value(0)
     measured = (gradients[key] * direction).sum()
     size = np.linalg.norm(gradients[key]) * np.linalg.norm(direction)
-    bound = 5e-3 if key == "object.rotations" else 1e-3  # reflections pass kinks between texels of the light
+    rounded = 1e-3 if VARIANT.startswith("llvm") else 4e-3  # a GPU's divisions, roots and exponentials are approximate
+    bound = 5e-3 if key == "object.rotations" else rounded  # reflections pass kinks between texels of the light
     assert abs(measured - expected) < bound * max(abs(expected), 0.05 * size)
 
 

@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from conftest import VARIANT
 
 import rgs_mi
 from rgs_mi.shading import split_sum
@@ -52,7 +53,7 @@ def reflected(integrator, lobe, values=BASE):
 @pytest.fixture(scope="module", params=["specular", "diffuse"])
 def gradients(request):
     """(lobe, name -> derivatives [batches, ...] of independent estimates)."""
-    rgs_mi.set_variant("llvm_ad_rgb")
+    rgs_mi.set_variant(VARIANT)
     found = {}
     for seed in range(12):
         pixels = mi.TensorXf(texels())
