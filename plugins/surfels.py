@@ -34,7 +34,7 @@ Flat Gaussians with a principled material (`rgs_mi.surfels.surfels.Surfels`), fo
  * - (Nested plugin)
    - |bsdf|
    - A :monosp:`principled` BSDF: the dielectric lobe has its constant ``eta`` or ``specular`` as it was when loaded,
-     the rest of it is ignored. (Default: eta = 1.5)
+     from 1.12 to 3.07; the rest of it is ignored. (Default: eta = 1.5)
 
 Tensors of another length may be assigned, which is how a fit adds and removes surfels: all ten before
 ``params.update()``. Surfels live in world space: a ``to_world`` is an error. Without proxies rays meet nothing, yet
@@ -51,6 +51,7 @@ from rgs_mi.core.errors import UserError
 from rgs_mi.core.turntable import Turntable
 from rgs_mi.shading.room import Room
 from rgs_mi.shading.split_sum import DEFAULT_ETA
+from rgs_mi.shading.tables import eta_of, specular_nodes
 from rgs_mi.surfels.ply import read_ply
 from rgs_mi.surfels.proxies import corners, quads
 from rgs_mi.surfels.surfels import CHANNELS, Surfels
@@ -215,9 +216,13 @@ def _eta(shape, props):
     if bsdf.class_name() != "Principled":
         raise UserError(f"surfels '{shape.id()}': the nested BSDF is a {bsdf.class_name()}: surfels need 'principled'")
     params = mi.traverse(bsdf)
-    if "eta" in params:
-        return round(params["eta"][0], 6)
-    return round(2 / (1 - (0.08 * params["specular"][0]) ** 0.5) - 1, 6)
+    eta = round(params["eta"][0] if "eta" in params else eta_of(params["specular"][0]), 6)
+    low, high = (eta_of(s) for s in specular_nodes()[[0, -1]])
+    if not low <= eta <= high:
+        raise UserError(
+            f"surfels '{shape.id()}': eta {eta:.4g} is not one of surfels: choose one from {low:.2f} to {high:.2f}"
+        )
+    return eta
 
 
 def _diagonal(corners):

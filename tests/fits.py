@@ -28,7 +28,9 @@ def model(seed=0):
     rng = np.random.default_rng(seed)
     x = rng.normal(size=(300, 3))
     x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return Model.start(x, x, np.full((300, 3), 0.3), np.full(300, 0.15), np.full((16, 32, 3), 0.5), np.eye(3), 1)
+    return Model.start(
+        x, x, np.full((300, 3), 0.3), np.full(300, 0.15), np.full((16, 32, 3), 0.5), np.eye(3), 1, specular=0.5
+    )
 
 
 def photographed() -> tuple[Surfels, Lighting]:

@@ -35,6 +35,7 @@ from ..priors.silhouettes import agreement
 from ..report import results
 from ..settings.config import to_dict
 from ..settings.settings import Settings
+from ..shading.tables import specular_of
 from ..viewer import server
 from ..viewer.live import Watch
 
@@ -191,6 +192,7 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
     def fit_of(shown: Dataset, settings: Settings) -> Fit:
         positions, normals, colors, spacing = points
         shading = _shading(scene, settings, dataset)
+        learns_specular = shading.specular == "split_sum" and any(settings.learning_rates.specular)
         center = shading.turntable.point if shading.turntable else middle  # a room turns about its center
         model = Model.start(
             positions,
@@ -207,6 +209,7 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
             settings.shader,
             two_sided=None if box is None else True,
             room=(center, settings.room * extent) if settings.room else None,
+            specular=specular_of(shading.eta) if learns_specular else None,
         )
         fit = Fit(shown, model, settings, extent, shading, _priors(shown, settings))
         if fit.cameras:

@@ -53,6 +53,7 @@ def export(
         scene,
         surfels,
         environment,
+        shading.eta,
         {
             "specular": shading.specular,
             "diffuse": shading.diffuse,
@@ -100,9 +101,9 @@ def _ids(root):
     return [found for e in root.iter() if e.tag != "sensor" and (found := e.get("id"))]
 
 
-def _fitted(scene, surfels, environment, properties):
-    """The scene's XML with results in place of photographs and of the starting light, with ``properties`` of the integrator
-    (None: its default), and without sensors."""
+def _fitted(scene, surfels, environment, eta, properties):
+    """The scene's XML with results in place of photographs and of the starting light, with the surfels' index of refraction
+    ``eta``, with ``properties`` of the integrator (None: its default), and without sensors."""
     root = copy.deepcopy(scene.root)
     for sensor in root.findall("sensor"):
         root.remove(sensor)
@@ -110,6 +111,11 @@ def _fitted(scene, surfels, environment, properties):
     shape.remove(shape.find("*[@name='photographs']"))
     shape.insert(0, _element("string", "filename", SURFELS))
     shape.insert(1, _element("boolean", "two_sided", str(surfels.two_sided).lower()))
+    if eta != scene.shading.eta:
+        for element in [e for e in shape if e.tag == "bsdf" or root.find(f"bsdf[@id='{e.get('id')}']") is not None]:
+            shape.remove(element)
+        shape.append(ET.Element("bsdf", type="principled"))
+        shape[-1].append(_element("float", "eta", f"{eta:.6g}"))
     emitter = scene.emitter_element(root)
     emitter[:] = [_element("string", "filename", ENVIRONMENT), _transform(environment.rotation)]
     emitter.set("type", "envmap")

@@ -26,7 +26,7 @@ SURFEL_PARAMETERS = (
     "delta_normal",
     "curvature",
 )
-ENVIRONMENT, SHADER, ROOM = "log_environment", "shader", "log_nearness"
+ENVIRONMENT, SHADER, ROOM, SPECULAR = "log_environment", "shader", "log_nearness", "logit_specular"
 #: The step of 3DGS's optimizers is relative to the gradient's own size, however small.
 _EPSILON = 1e-15
 _LOG_RADIANCE = (-9.0, 8.0)  # texels that no ray tells apart would else drift to overflow
@@ -47,9 +47,10 @@ class Model:
     """Surfels, environment and shader as Adam sees them.
 
     ``parameters`` are NumPy arrays [N, channels] named as `SURFEL_PARAMETERS`, `ENVIRONMENT` [rows, columns, 3], the
-    logarithm of radiance, `SHADER` [weights], unless f_φ is the identity, and `ROOM` [6], the logarithm of how near the walls
-    of a `Room` around ``center`` ([3], world space) are, unless the light is at infinity. ``rotation`` [3, 3] takes the
-    environment's frame to the world's. ``two_sided`` is that of `Surfels`.
+    logarithm of radiance, `SHADER` [weights], unless f_φ is the identity, `ROOM` [6], the logarithm of how near the walls
+    of a `Room` around ``center`` ([3], world space) are, unless the light is at infinity, and `SPECULAR` [1], that of all
+    surfels, unless it is given. ``rotation`` [3, 3] takes the environment's frame to the world's. ``two_sided`` is that of
+    `Surfels`.
     """
 
     def __init__(
@@ -82,6 +83,7 @@ class Model:
         shader: str = "identity",
         two_sided: bool | None = None,
         room: tuple[np.ndarray | Sequence[float], float] | None = None,
+        specular: float | None = None,
     ) -> "Model":
         """Make the model that a fit starts with.
 
@@ -96,6 +98,7 @@ class Model:
           shader:      'identity' or 'mlp', as in `Settings`
           two_sided:   see `Surfels` (None: where normals are random; others point outwards)
           room:        center and distance of the walls on which the environment is painted (None: it is at infinity)
+          specular:    (22) of `shading/tables.py`, which is learned (None: it is given)
         """
         from ..surfels.surfels import rotation_from_normal
 
@@ -122,6 +125,7 @@ class Model:
                 ENVIRONMENT: np.log(np.maximum(environment, 1e-3)),
                 **({SHADER: initial_weights(seed)} if shader == "mlp" else {}),
                 **({ROOM: np.full(len(SIDES), -np.log(room[1]))} if room else {}),
+                **({} if specular is None else {SPECULAR: np.full(1, logit(specular))}),
             },
             rotation,
             two_sided,
@@ -165,6 +169,10 @@ class Model:
     def shader(self) -> Shader | None:
         """Return f_φ; None: the identity."""
         return Shader(self.optimizer[SHADER]) if SHADER in self.optimizer else None
+
+    def specular(self) -> "mi.Float | None":
+        """Return specular of all surfels, in [0, 1], of width 1, differentiable; None: it is not learned."""
+        return _sigmoid(self.optimizer[SPECULAR]).array if SPECULAR in self.optimizer else None
 
     # ---- Surgery ----
 
@@ -223,7 +231,7 @@ class Model:
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray]) -> "Model":
         """Make the model whose `state` these ``arrays`` are."""
-        names = [name for name in (*SURFEL_PARAMETERS, ENVIRONMENT, SHADER, ROOM) if name in arrays]
+        names = [name for name in (*SURFEL_PARAMETERS, ENVIRONMENT, SHADER, ROOM, SPECULAR) if name in arrays]
         parameters = {name: arrays[name] for name in names}
         model = cls(parameters, arrays["rotation"], bool(arrays["two_sided"]), arrays.get("center", (0, 0, 0)))
         for name in names:

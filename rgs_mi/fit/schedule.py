@@ -7,7 +7,7 @@ import numpy as np
 
 from ..settings.settings import Settings, Stage
 from ..shading.lighting import Shading
-from .model import ENVIRONMENT, ROOM, SHADER
+from .model import ENVIRONMENT, ROOM, SHADER, SPECULAR
 
 #: The field of `LearningRates` that each parameter of a `Model` obeys.
 _RATES = {
@@ -25,6 +25,7 @@ _RATES = {
     ENVIRONMENT: "environment",
     SHADER: "shader",
     ROOM: "room",
+    SPECULAR: "specular",
 }
 _NORMALS, _HELD = ("rotations", "delta_normal", "curvature"), 0.1  # the part of their rates that they have at first
 # A mirror ball, its radius r 3/8 of the picture, turns what its middle reflects by 2/r a pixel: π r/2 rows are told apart
@@ -97,8 +98,8 @@ class Schedule:
         s = self.settings
         rates = {name: self.value(getattr(s.learning_rates, _RATES[name]), progress) for name in names}
         rates["centers"] *= extent
-        if ROOM in rates and progress < s.refine_start:
-            rates[ROOM] = 0.0  # of a light that is a blur yet all walls come near, to give it shape
+        if progress < s.refine_start:  # of a light that is a blur yet all walls come near, to give it shape
+            rates |= {name: 0.0 for name in (ROOM, SPECULAR) if name in rates}
         # A light that has no shape yet would turn normals that the hull has right. Two-sided surfels began at random.
         if progress < s.normals_start and not two_sided:
             rates |= {name: _HELD * rates[name] for name in _NORMALS}

@@ -15,6 +15,7 @@ from ..datasets.types import Dataset, DepthPrior
 from ..settings.settings import Settings, Stage
 from ..shading import deferred
 from ..shading.lighting import Lighting, Shading, lighting_of
+from ..shading.tables import eta_of
 from ..surfels.proxies import Proxies
 from ..surfels.surfels import CHANNELS, Surfels
 from . import light_maps, losses, reflection_guided
@@ -156,6 +157,13 @@ class Fit:
     @property
     def shading(self) -> Shading:
         """How the model is shaded by now: that of a scene that renders the same."""
+        shading = self._shading
+        specular = self.model.specular()
+        return shading if specular is None else replace(shading, eta=eta_of(float(specular[0])))
+
+    @property
+    def _shading(self):
+        """`shading` but for what a step reads of the model itself."""
         shading = self.schedule.shading(self.progress)
         return replace(shading, turntable=self.turns.table) if self.turns else shading
 
@@ -164,7 +172,7 @@ class Fit:
     def lighting(self, surfels: Surfels, training: bool = False) -> Lighting | None:
         """How the model's ``surfels`` are shaded by now; None where nothing is specular. ``training``: as a step has it,
         with what reflected rays meet, and the light's sampling, of some steps ago."""
-        shading = self.shading
+        shading = self._shading if training else self.shading
         if shading.specular == "none":
             return None
         shader, sampled = self.model.shader(), shading.specular == "monte_carlo"
@@ -182,11 +190,12 @@ class Fit:
             proxies=self.proxies,
             irradiance_visibility=self.irradiance_visibility,
             paired=True,
+            learned_specular=self.model.specular(),
         )
 
     def _refresh(self, surfels):
         """Rebuild what serves many steps."""
-        shading, due = self.shading, self.step_number % _REBUILD == 0
+        shading, due = self._shading, self.step_number % _REBUILD == 0
         sampled = shading.specular == "monte_carlo"
         if due or self.emitter is None:
             self.emitter = self.model.environment().emitter() if sampled else None
@@ -203,7 +212,7 @@ class Fit:
     def _hidden(self, surfels):
         """What ``surfels`` hide of the light; None where nothing asks."""
         self.irradiance_visibility = None
-        explained = self.shading.diffuse == "lit" or self.schedule.explains(self.progress)
+        explained = self._shading.diffuse == "lit" or self.schedule.explains(self.progress)
         lighting = self.lighting(surfels, training=True) if self.proxies and explained else None
         if lighting is None:
             return None

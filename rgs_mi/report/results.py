@@ -225,6 +225,7 @@ def _facts(fit) -> dict:
         "train_views": len(fit.dataset.train),
         "test_views": len(fit.dataset.test),
         "turntable": table and asdict(table),
+        "eta": fit.shading.eta,
         "room": room and {"center": room.center, "distances": dict(zip(SIDES, room.distances))},
         "origin": fit.dataset.origin,
         "photographs": str(fit.dataset.root.resolve()),

@@ -86,6 +86,10 @@ class LearningRates:
     environment: Rates = Field(default=(6e-2, 5e-3), description="Of the environment's texels.")
     shader: Rates = Field(default=(1e-2, 1e-3), description="Of the network of `shader`.")
     room: Rates = Field(default=(2e-2, 1e-3), description="Of the distances of the room's walls, their logarithms.")
+    specular: Rates = Field(
+        default=(1e-2, 1e-3),
+        description="Of what surfels that are no metal reflect, one number for all; 0, 0: as the scene says.",
+    )
     poses: Rates = Field(
         default=(0.2, 0.01), description="Of the cameras' poses: pixels of the images in use that what they show moves by."
     )

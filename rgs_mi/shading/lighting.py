@@ -173,15 +173,15 @@ class Lighting:
         return replace(self, estimator=self.estimator.for_secondary_bounce(), indirect=None, box=None)
 
     def learned(self) -> list:
-        """Return the arrays that a fit changes: those of the environment as the estimator has it, and the weights of the
-        shader where there is one."""
-        return [*self.estimator.environment.learned(), *([self.shader.weights] if self.shader else [])]
+        """Return the arrays that a fit changes: those of the estimator, the environment's texels as it has them first, and the
+        weights of the shader where there is one."""
+        return [*self.estimator.learned(), *([self.shader.weights] if self.shader else [])]
 
     def with_learned(self, arrays: list, surfels: Surfels) -> "Lighting":
         """Return the same lighting with other ``arrays`` in place of `learned`, and for other ``surfels``, moved ones."""
         return replace(
             self,
-            estimator=replace(self.estimator, environment=self.estimator.environment.with_learned(arrays)),
+            estimator=self.estimator.with_learned(arrays),
             shader=self.shader and Shader(arrays[-1]),
             indirect=self.indirect and replace(self.indirect, surfels=surfels),
         )
@@ -197,6 +197,7 @@ def lighting_of(
     proxies: Proxies | None = None,
     irradiance_visibility: "mi.Color3f | None" = None,
     paired: bool = False,
+    learned_specular: "mi.Float | None" = None,
 ) -> Lighting | None:
     """The `Lighting` of ``surfels`` that are shaded as ``shading`` says; None where it says that nothing is specular.
 
@@ -208,12 +209,13 @@ def lighting_of(
       proxies: what reflected rays meet; None builds them of ``surfels``
       irradiance_visibility: a of (9), one entry per surfel; None computes it where it is needed
       paired:  see `MonteCarlo`
+      learned_specular: see `SplitSum`
     """
     if shading.specular == "none":
         return None
     assert environment is not None
     lit, sampled = shading.diffuse == "lit", shading.specular == "monte_carlo"
-    estimator = SplitSum(environment, shading.eta)
+    estimator = SplitSum(environment, shading.eta, learned_specular=learned_specular)
     if sampled:
         random = dr.opaque(mi.UInt32, seed)
         estimator = MonteCarlo(environment, emitter, shading.eta, shading.samples, random, paired)

@@ -49,6 +49,14 @@ class MonteCarlo:
     seed: "mi.UInt32"
     paired: bool = False
 
+    def learned(self) -> list:
+        """Return the arrays that a fit changes: those of the environment."""
+        return self.environment.learned()
+
+    def with_learned(self, arrays: list) -> "MonteCarlo":
+        """Return the same estimator with other ``arrays`` in place of `learned`."""
+        return replace(self, environment=self.environment.with_learned(arrays))
+
     def specular(self, surface: Surface, incident_radiance: IncidentRadiance | None = None) -> "mi.Color3f":
         """Return C_s of (7); see `SplitSum.specular`."""
         return self._integral(SpecularLobe, surface, incident_radiance)

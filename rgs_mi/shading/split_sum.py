@@ -6,7 +6,7 @@ with P the environment averaged over the BSDF's lobe seen along the normal (`pre
 seen from elsewhere ((8) of `taps.py`), and E its albedo ((4) of `tables.py`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -21,12 +21,23 @@ DEFAULT_ETA = 1.5  # the principled BSDF's default, specular = 0.5
 
 @dataclass
 class SplitSum:
-    """The split-sum estimator, with a filtered ``environment``, an index of refraction ``eta``, and a table of `taps`
-    (None: the shipped one)."""
+    """The split-sum estimator, with a filtered ``environment``, an index of refraction ``eta``, in whose place a fit has
+    ``learned_specular``, (22) of `tables.py`, of width 1, and a table of `taps` (None: the shipped one)."""
 
     environment: FilteredEnvironment
     eta: float = DEFAULT_ETA
     entries: "mi.Float | None" = None
+    learned_specular: "mi.Float | None" = None
+
+    def learned(self) -> list:
+        """Return the arrays that a fit changes: those of the environment, and specular where it is learned."""
+        return [*self.environment.learned(), *([] if self.learned_specular is None else [self.learned_specular])]
+
+    def with_learned(self, arrays: list) -> "SplitSum":
+        """Return the same estimator with other ``arrays`` in place of `learned`."""
+        known = self.learned_specular is not None
+        specular = arrays[len(self.environment.learned())] if known else None
+        return replace(self, environment=self.environment.with_learned(arrays), learned_specular=specular)
 
     def specular(self, surface: Surface, incident_radiance: IncidentRadiance | None = None) -> "mi.Color3f":
         """Return C_s, the linear radiance that the specular lobes of a `Surface` reflect towards its ``view``, differentiable
@@ -37,7 +48,7 @@ class SplitSum:
         normal, view, roughness, metallic, base_color, point = surface
         cosine = surface.cosine
         reflected = 2 * cosine * normal - view
-        E, phi = albedo(cosine, roughness, metallic, base_color, self.eta)
+        E, phi = albedo(cosine, roughness, metallic, base_color, self._specular(dr.width(cosine)))
         incoming = mi.Color3f(0)
         for a, r, w in taps(cosine, roughness, phi, self.entries):
             incoming += w * self.environment.eval(dr.normalize(reflected + a * normal), r, point)
@@ -53,9 +64,15 @@ class SplitSum:
     ) -> "mi.Color3f":
         """Return C_d of the diffuse lobe, as `specular` does C_s. It receives the part ``irradiance_visibility`` of the light
         ((9) of `indirect.py`); ``incident_radiance`` is not called, since that lobe has no one direction."""
-        E = _table(surface.cosine, surface.roughness, (3,), self.eta)[0]
+        (E,) = tables.albedos(surface.cosine, surface.roughness, (tables.DIFFUSE,))
         received = self.environment.eval_diffuse(surface.normal, surface.point) * irradiance_visibility
         return received * E * (1 - surface.metallic) * surface.base_color
+
+    def _specular(self, width):
+        """(22). What is learned is ``width`` times the same: kernels then add its gradient up as they go."""
+        if self.learned_specular is None:
+            return dr.opaque(mi.Float, tables.specular_of(self.eta))
+        return dr.gather(mi.Float, self.learned_specular, dr.full(mi.UInt32, 0, width), mode=dr.ReduceMode.Expand)
 
     def for_secondary_bounce(self) -> "SplitSum":
         """Return the estimator of what a reflected ray meets: this one."""
@@ -63,32 +80,14 @@ class SplitSum:
 
 
 def albedo(
-    cosine: "mi.Float", roughness: "mi.Float", metallic: "mi.Float", base_color: "mi.Color3f", eta: float
+    cosine: "mi.Float", roughness: "mi.Float", metallic: "mi.Float", base_color: "mi.Color3f", specular: "mi.Float"
 ) -> "tuple[mi.Color3f, mi.Float]":
     """Return E of (4), what the specular lobes reflect of a constant environment, and φ, the part of it that Schlick's
-    Fresnel term adds to a mirror of the constant colour F_0; ``cosine`` is n·ω_o, ``eta`` the index of refraction."""
-    dielectric, black, white = _table(cosine, roughness, (0, 1, 2), eta)
+    Fresnel term adds to a mirror of the constant colour F_0; ``cosine`` is n·ω_o, ``specular`` that of (22). Differentiable in
+    all of them."""
+    dielectric = tables.dielectric(cosine, roughness, specular)
+    black, white = tables.albedos(cosine, roughness, (tables.BLACK, tables.WHITE))
     E = (1 - metallic) * dielectric + metallic * (base_color * (white - black) + black)
     mean = lambda color: (color.x + color.y + color.z) / 3  # dr.mean() would take that of all lanes
-    F_0 = dr.lerp(((eta - 1) / (eta + 1)) ** 2, mean(base_color), metallic)
+    F_0 = dr.lerp(0.08 * specular, mean(base_color), metallic)
     return E, dr.clip(1 - F_0 * white / mean(E), 0, 1)
-
-
-def _table(cosine, roughness, columns, eta):
-    """The entries ``columns`` of `tables.albedo_table`, interpolated, a list of ``mi.Float``."""
-    table = tables.albedo_table(eta, mi.variant())
-    entries = mi.Float(table.transpose(2, 0, 1).ravel())
-    plane = tables.COSINES * tables.ROUGHNESSES
-    row, column, fy, fx = tables.cell(cosine, roughness, tables.COSINES, tables.ROUGHNESSES)
-    index = mi.UInt32(row * tables.ROUGHNESSES + column)
-    values = []
-    for k in columns:
-        fetch = lambda i: dr.gather(mi.Float, entries, i + k * plane)
-        values.append(
-            dr.lerp(
-                dr.lerp(fetch(index), fetch(index + 1), fx),
-                dr.lerp(fetch(index + tables.ROUGHNESSES), fetch(index + tables.ROUGHNESSES + 1), fx),
-                fy,
-            )
-        )
-    return values

@@ -6,19 +6,30 @@ With diffuse lobes off, the principled BSDF is linear in its Fresnel terms. For 
 
 where the three terms are the directional albedos of its dielectric (base colour 0), of a white metal and of a black
 metal (whose Schlick Fresnel term still rises to one at grazing angles), and its diffuse lobe reflects (1 − m) c E_diffuse.
-They depend on n·ω_o and roughness alone and are integrated here by evaluating the plugin itself; only the choice of sample
-directions is ours.
+They depend on n·ω_o and roughness alone, the first one on the index of refraction η, too, and are integrals of the plugin
+itself; only the choice of sample directions is ours. ``albedos.npy`` holds what `integrated` returned. The plugin's
+``specular`` is another scale for η:
+
+    specular = F_0 / 0.08,   F_0 = ((η − 1) / (η + 1))²                                            (22)
 """
 
 import functools
+from collections.abc import Sequence
+from importlib import resources
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.arrays import as_float
+
 COSINES = 48
 ROUGHNESSES = 32
 _SIDE = 96  # stratified samples along each dimension
+SPECULARS = 17
+BLACK, WHITE, DIFFUSE = range(SPECULARS, SPECULARS + 3)  # tables after those of `specular_nodes`
+FILE = "albedos.npy"
+_LEAST, _MOST = 0.2, 1.8  # √specular: indices of refraction from 1.12 to 3.07
 MIN_ROUGHNESS = 0.032  # the principled BSDF clamps its GGX width α = roughness² at 0.001
 
 
@@ -30,6 +41,22 @@ def cosine_nodes() -> np.ndarray:
 def roughness_nodes() -> np.ndarray:
     """Return the values of roughness at the table's columns, [ROUGHNESSES]."""
     return np.linspace(0, 1, ROUGHNESSES)
+
+
+def specular_nodes() -> np.ndarray:
+    """Return the values of specular at the tables of dielectrics, [SPECULARS]: quadratic, since what grazing angles reflect bends
+    near 0."""
+    return np.linspace(_LEAST, _MOST, SPECULARS) ** 2
+
+
+def specular_of(eta: float) -> float:
+    """Return specular of (22) for the index of refraction ``eta``."""
+    return ((eta - 1) / (eta + 1)) ** 2 / 0.08
+
+
+def eta_of(specular: float) -> float:
+    """Return the index of refraction that has this ``specular`` of (22)."""
+    return float(2 / (1 - np.sqrt(0.08 * specular)) - 1)
 
 
 def cell(
@@ -65,12 +92,39 @@ def interaction(wi: "mi.Vector3f") -> "mi.SurfaceInteraction3f":
     return si
 
 
-@functools.lru_cache(maxsize=4)
-def albedo_table(eta: float, variant: str) -> np.ndarray:
-    """Return (E_dielectric, E_black, E_white) of (4) and E_diffuse, [COSINES, ROUGHNESSES, 4] float32, for the index of
-    refraction ``eta``; ``variant``, the active one, keys the cache."""
+@functools.lru_cache(maxsize=2)
+def _entries(variant):
+    with (resources.files("rgs_mi.shading") / FILE).open("rb") as stream:
+        return as_float(np.load(stream, allow_pickle=False))
+
+
+def albedos(cosine: "mi.Float", roughness: "mi.Float", tables: "Sequence[mi.UInt32 | int]") -> "list[mi.Float]":
+    """Return what each of the ``tables`` says of a ``cosine`` = n·ω_o and a ``roughness``: the index of one of `specular_nodes`,
+    `BLACK`, `WHITE` or `DIFFUSE`."""
+    entries, plane = _entries(mi.variant()), COSINES * ROUGHNESSES
+    row, column, fy, fx = cell(cosine, roughness, COSINES, ROUGHNESSES)
+    index = mi.UInt32(row * ROUGHNESSES + column)
+    values = []
+    for k in tables:
+        fetch = lambda i: dr.gather(mi.Float, entries, i + k * plane)
+        along = lambda i: dr.lerp(fetch(i), fetch(i + 1), fx)
+        values.append(dr.lerp(along(index), along(index + ROUGHNESSES), fy))
+    return values
+
+
+def dielectric(cosine: "mi.Float", roughness: "mi.Float", specular: "mi.Float") -> "mi.Float":
+    """Return E_dielectric of (4) for ``specular`` of (22), in which it is differentiable, too."""
+    position = (dr.sqrt(specular) - _LEAST) / (_MOST - _LEAST) * (SPECULARS - 1)
+    below = dr.clip(mi.Int32(dr.detach(position)), 0, SPECULARS - 2)
+    lower, upper = albedos(cosine, roughness, [mi.UInt32(below), mi.UInt32(below + 1)])
+    return dr.lerp(lower, upper, position - mi.Float(below))
+
+
+def integrated(speculars: np.ndarray) -> np.ndarray:
+    """Return E_dielectric of (4) for each of ``speculars``, E_black, E_white and E_diffuse, [len + 3, COSINES, ROUGHNESSES]
+    float32."""
+    materials = [*((0, 0, eta_of(s)) for s in speculars), (1, 0, 1.5), (1, 1, 1.5)]
     mu = np.maximum(cosine_nodes(), 1e-3)
-    wi = mi.Vector3f(mi.Float(np.sqrt(1 - mu**2)), 0, mi.Float(mu))
     n = _SIDE * _SIDE
     k = dr.arange(mi.UInt32, len(mu) * n)
     jitter = mi.PCG32(size=len(mu) * n)
@@ -79,23 +133,22 @@ def albedo_table(eta: float, variant: str) -> np.ndarray:
         / _SIDE
     )
     dr.eval(sample)
-    wi = dr.gather(mi.Vector3f, wi, k // n)
-    si = interaction(wi)
-    table = np.zeros((COSINES, ROUGHNESSES, 4), np.float32)
-    everywhere = mi.warp.square_to_cosine_hemisphere(sample)
+    wi = dr.gather(mi.Vector3f, mi.Vector3f(mi.Float(np.sqrt(1 - mu**2)), 0, mi.Float(mu)), k // n)
+    si, everywhere = interaction(wi), mi.warp.square_to_cosine_hemisphere(sample)
+    tables = np.zeros((len(materials) + 1, COSINES, ROUGHNESSES), np.float32)
     for column, roughness in enumerate(roughness_nodes()):
         alpha = dr.opaque(mi.Float, max(roughness, MIN_ROUGHNESS) ** 2)
         h, _ = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True).sample(wi, sample)
         wo = mi.reflect(wi, h)
         pdf = mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, True).pdf(wi, h) / (4 * dr.dot(wo, h))
         valid = (wo.z > 0) & (pdf > 0)
-        for row, (metallic, base_color) in enumerate([(0, 0), (1, 0), (1, 1)]):
+        for table, (metallic, base_color, eta) in zip(tables, materials):
             value = principled(float(roughness), metallic, base_color, eta).eval(mi.BSDFContext(), si, wo).x
-            table[:, column, row] = dr.block_sum(dr.select(valid, value / pdf, 0), n).numpy() / n
-        white, black = (principled(float(roughness), 0, c, eta).eval(mi.BSDFContext(), si, everywhere).x for c in (1, 0))
+            table[:, column] = dr.block_sum(dr.select(valid, value / pdf, 0), n).numpy() / n
+        white, black = (principled(float(roughness), 0, c, 1.5).eval(mi.BSDFContext(), si, everywhere).x for c in (1, 0))
         value = (white - black) / mi.warp.square_to_cosine_hemisphere_pdf(everywhere)
-        table[:, column, 3] = dr.block_sum(value, n).numpy() / n
-    return table
+        tables[-1, :, column] = dr.block_sum(value, n).numpy() / n
+    return tables
 
 
 def lobe(roughness: float, angles: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
+from rgs_mi.plugins import surfels_of
 from scipy import ndimage
 
 from rgs_mi.commands.optimize import optimize, start
@@ -166,6 +167,8 @@ def test_a_run_in_a_room(tmp_path):
     walls = json.loads((run / "metrics.json").read_text())["room"]["distances"]
     assert len(set(walls.values())) == 6 and all(1 < d < 9 for d in walls.values())
     first = load_scene(run / "scene.xml", {})
+    eta = json.loads((run / "metrics.json").read_text())["eta"]
+    assert surfels_of(first, run).eta == pytest.approx(eta, abs=1e-5) and abs(eta - 1.5) > 1e-3  # one that was learned
     assert first.integrator().room.distances == pytest.approx(list(walls.values()), rel=1e-4)
     sensor = first.sensors()[0]
     image = straight(np.array(mi.render(first, sensor=sensor, spp=1)))

@@ -6,15 +6,16 @@ from pathlib import Path
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pytest
 
 from rgs_mi.core.color import to_8bit
 from rgs_mi.datasets.types import Dataset, View
 from rgs_mi.fit import losses
-from rgs_mi.fit.model import Model
+from rgs_mi.fit.model import Model, logit
 from rgs_mi.fit.objective import Objective
 from rgs_mi.fit.trainer import Fit
 from rgs_mi.settings.settings import LearningRates
-from rgs_mi.shading import deferred
+from rgs_mi.shading import deferred, tables
 from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.lighting import Lighting, Shading
 from rgs_mi.shading.split_sum import SplitSum
@@ -42,9 +43,10 @@ def matte() -> Surfels:
     return Surfels.from_numpy(fields | materials, two_sided=False)
 
 
-def photographs(truth) -> Dataset:
+def photographs(truth, specular=0.5) -> Dataset:
     """Six views of the ball, lit."""
-    lighting = Lighting(SplitSum(Environment(mi.TensorXf(np.float32(light())), np.eye(3)).filtered()), lit=True)
+    environment = Environment(mi.TensorXf(np.float32(light())), np.eye(3)).filtered()
+    lighting = Lighting(SplitSum(environment, tables.eta_of(specular)), lit=True)
     views = []
     for k in range(6):
         camera = orbit_camera(k, size=(72, 64))
@@ -56,15 +58,19 @@ def photographs(truth) -> Dataset:
     return Dataset(views, [])
 
 
-def fitted(diffuse) -> tuple[Fit, Surfels]:
-    """A fit of colours and radiance alone: all else is as it should be."""
+def fitted(diffuse, specular=None) -> tuple[Fit, Surfels]:
+    """A fit of colours and radiance alone, or where ``specular`` says what the ball reflects, of that alone: all else is as it
+    should be."""
     truth = matte()
     centers = truth.numpy()["centers"]
     scale = float(truth.numpy()["scales"].mean())
     spacing, grey = np.full(COUNT, scale), np.full((COUNT, 3), 0.3)
-    model = Model.start(centers, centers, grey, spacing, light(), np.eye(3), 1, opacity=0.8, roughness=0.6)
+    start = specular and 0.5
+    model = Model.start(centers, centers, grey, spacing, light(), np.eye(3), 1, opacity=0.8, roughness=0.6, specular=start)
     model.set("rotations", truth.numpy()["rotations"])
     model.set("logit_metallic", np.full((COUNT, 1), -7.0))
+    if specular:
+        model.set("logit_base_color", logit(truth.numpy()["base_color"]))
     held = (
         "centers",
         "rotations",
@@ -75,10 +81,11 @@ def fitted(diffuse) -> tuple[Fit, Surfels]:
         "environment",
         "roughness",
         "metallic",
+        *(["base_color"] if specular else []),
     )
-    rates = replace(LearningRates(), sh_dc=(0.2, 0.02), **{name: (0.0, 0.0) for name in held})
-    settings = replace(SETTINGS, iterations=120, indirect_start=0.0, learning_rates=rates)
-    fit = Fit(photographs(truth), model, settings, 1.0, Shading(diffuse=diffuse))
+    rates = replace(LearningRates(), sh_dc=(0.2, 0.02), specular=(0.1, 0.02), **{name: (0.0, 0.0) for name in held})
+    settings = replace(SETTINGS, iterations=120, indirect_start=0.0, refine_start=0.2, learning_rates=rates)
+    fit = Fit(photographs(truth, specular or 0.5), model, settings, 1.0, Shading(diffuse=diffuse))
     while fit.progress < 1:
         fit.step()
     return fit, truth
@@ -94,6 +101,12 @@ def test_base_colors_are_found_beside_the_radiance():
         psnr[diffuse] = fit.psnr
     assert errors["relightable"] < 0.04 < 0.15 < errors["radiance"]
     assert min(psnr.values()) > 45
+
+
+def test_what_no_metal_reflects_is_found():
+    fit, _ = fitted("lit", specular=0.9)
+    assert fit.model.specular()[0] == pytest.approx(0.9, abs=0.05)
+    assert fit.shading.eta == pytest.approx(tables.eta_of(0.9), abs=0.03)
 
 
 def test_the_residual_and_its_gradient():
