@@ -279,7 +279,8 @@ def residual(radiance: "mi.Color3f", lit: "mi.Color3f", shown: "mi.Float") -> "m
 
         Σ a |C_d − C_d^lit| / Σ a                                                                   (21)
 
-    Photographs leave open what of a radiance is light and what is material; (21) leaves to neither what both can explain."""
+    Photographs leave open what of a radiance is light and what is material: (21) takes for light what the base color can
+    reflect."""
     d = dr.abs(radiance - lit)
     return dr.sum(shown * (d.x + d.y + d.z)) / (3 * dr.maximum(dr.sum(shown), 1e-12))
 

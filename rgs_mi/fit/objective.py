@@ -97,12 +97,11 @@ class Objective:
             terms["depth"] = w.depth * losses.pearson_depth(depth, photo.prior, covered, photo.inverse)
         return terms, mask
 
-    def residual(self, surfels: Surfels, lighting: Lighting, camera: Camera, radiance_yields: bool) -> "mi.Float":
+    def residual(self, surfels: Surfels, lighting: Lighting, camera: Camera) -> "mi.Float":
         """Return the weighted part of the ``surfels``' diffuse radiance, as ``camera`` sees them, that is not what their base
-        color reflects under ``lighting``; of width 1. It has gradients in base color and metallic and, where the
-        ``radiance_yields``, in that; none in the light, which is what reflections say that it is."""
-        moved = ("base_color", "metallic", *(["sh"] if radiance_yields else []))
-        held = {name: dr.detach(getattr(surfels, name)) for name in CHANNELS if name not in moved}
+        color reflects under ``lighting``; of width 1. It has gradients in the base color alone: of what is no metal,
+        photographs under the light that they were taken in then show the same as without it."""
+        held = {name: dr.detach(getattr(surfels, name)) for name in CHANNELS if name != "base_color"}
         surfels = replace(surfels, **held).split()
         lighting = lighting.with_learned([dr.detach(v) for v in lighting.learned()], surfels)
         center = surfels.column(mi.Point3f, "centers")

@@ -295,8 +295,7 @@ class Fit:
         measured = [self._view(i, surfels, lighting, 1 / len(views), statistics) for i in views]
         error = dr.mean([m.pop("error") for m in measured])
         if lighting and self.schedule.explains(self.progress):
-            fine = self.progress >= self.settings.refine_start  # a light that is a blur would spoil the radiance
-            loss = self.objective.residual(surfels, lighting, self.dataset.train[views[0]].camera, fine)
+            loss = self.objective.residual(surfels, lighting, self.dataset.train[views[0]].camera)
             dr.backward(loss)
             measured.append({"loss.residual": dr.detach(loss)})
         gradients = [dr.grad(leaf) for leaf in leaves]

@@ -87,7 +87,7 @@ class LearningRates:
     shader: Rates = Field(default=(1e-2, 1e-3), description="Of the network of `shader`.")
     room: Rates = Field(default=(2e-2, 1e-3), description="Of the distances of the room's walls, their logarithms.")
     specular: Rates = Field(
-        default=(1e-2, 1e-3),
+        default=(3e-2, 3e-3),
         description="Of what surfels that are no metal reflect, one number for all; 0, 0: as the scene says.",
     )
     poses: Rates = Field(
