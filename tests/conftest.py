@@ -1,4 +1,3 @@
-import os
 import signal
 
 import pytest
@@ -7,13 +6,12 @@ import rgs_mi
 
 from fits import random_photographs
 from runs import end_all, make_inputs
+from variants import VARIANT
 
 # A shell that starts the tests in the background has them ignore Ctrl-C, and nohup a terminal that goes, which processes that
 # they start would inherit.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
-
-VARIANT = os.environ.get("RGS_MI_VARIANT", "llvm_ad_rgb")
 
 
 @pytest.fixture(autouse=True)

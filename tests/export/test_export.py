@@ -8,7 +8,6 @@ import struct
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import VARIANT
 
 import rgs_mi
 from rgs_mi.commands.export import FORMATS, export
@@ -20,6 +19,7 @@ from judges import package, splat_transform, validated_gltf
 from readers import glb_splats, harmonics
 from runs import start_script
 from scenes import sphere_surfels
+from variants import VARIANT
 
 SCENE = """<scene version="3.0.0">
     <integrator type="rgs_deferred"> <boolean name="hide_emitters" value="true"/> </integrator>

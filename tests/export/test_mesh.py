@@ -12,7 +12,6 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import VARIANT
 from scipy.spatial import KDTree
 
 import rgs_mi
@@ -38,6 +37,7 @@ from rgs_mi.targets.meshes import join, unit
 
 from judges import blender, package, validated_gltf
 from scenes import orbit_camera, sphere_surfels, tangent_surfels
+from variants import VARIANT
 
 SIZE = 64
 

@@ -5,7 +5,6 @@ import json
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import VARIANT
 
 import rgs_mi
 from rgs_mi.commands.recovery import hidden, recovery, true_maps
@@ -19,6 +18,7 @@ from rgs_mi.export.relight import edit, relight
 from rgs_mi.export.render import render_scene, sensor_dict, straight
 
 from runs import TARGET, make_inputs
+from variants import VARIANT
 
 SETTINGS = [
     "iterations=150",

@@ -4,7 +4,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import VARIANT
 
 import rgs_mi
 from rgs_mi.core.errors import UserError
@@ -12,6 +11,7 @@ from rgs_mi.surfels.ply import write_ply
 from rgs_mi.surfels.surfels import CHANNELS, SH_0, Surfels, rotation_from_normal
 
 from scenes import orbit_camera, sphere_surfels
+from variants import VARIANT
 
 ALL_AOVS = "depth,sh_normal,albedo,roughness,metallic,alpha,specular,diffuse"
 AOV_CHANNELS = [

@@ -4,13 +4,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from conftest import VARIANT
 
 import rgs_mi
 from rgs_mi.shading import split_sum
 from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.monte_carlo import MonteCarlo
 from rgs_mi.shading.surface import Surface
+
+from variants import VARIANT
 
 ROUGHNESS = np.float32([0.04, 0.2, 0.4, 0.8])
 BASE = {
