@@ -14,7 +14,9 @@ from fits import SETTINGS, model, random_photographs
 
 STEPS = 8  # after which no gradient of the light waits, which each process has its own of (`LightMaps`)
 GROWING = Density(start=0.0, stop=1.0, refine_every=4, grow_grad2d=1e-5, max_surfels=400)
-LEARNED = replace(SETTINGS, cameras="learned", exposure="learned", cameras_start=0.0, density=GROWING)
+# Which pixels are reflective is a threshold, which rounding passes: without the losses that ask
+WEIGHTS = replace(SETTINGS.weights, normal=0.0, minimum_variation=0.0)
+LEARNED = replace(SETTINGS, cameras="learned", exposure="learned", cameras_start=0.0, density=GROWING, weights=WEIGHTS)
 
 
 def stepped(settings, ranks: Ranks, steps: int = STEPS) -> Fit:
