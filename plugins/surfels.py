@@ -34,7 +34,7 @@ Flat Gaussians with a principled material (`rgs_mi.surfels.surfels.Surfels`), fo
  * - (Nested plugin)
    - |bsdf|
    - A :monosp:`principled` BSDF: the dielectric lobe has its constant ``eta`` or ``specular`` as it was when loaded,
-     from 1.12 to 3.07; the rest of it is ignored. (Default: eta = 1.5)
+     from 1 to 3.07; the rest of it is ignored. (Default: eta = 1.5)
 
 Tensors of another length may be assigned, which is how a fit adds and removes surfels: all ten before
 ``params.update()``. Surfels live in world space: a ``to_world`` is an error. Without proxies rays meet nothing, yet

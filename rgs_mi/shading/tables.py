@@ -26,10 +26,10 @@ from ..core.arrays import as_float
 COSINES = 48
 ROUGHNESSES = 32
 _SIDE = 96  # stratified samples along each dimension
-SPECULARS = 17
+SPECULARS = 19
 BLACK, WHITE, DIFFUSE = range(SPECULARS, SPECULARS + 3)  # tables after those of `specular_nodes`
 FILE = "albedos.npy"
-_LEAST, _MOST = 0.2, 1.8  # √specular: indices of refraction from 1.12 to 3.07
+_MOST = 1.8  # √specular: indices of refraction up to 3.07
 MIN_ROUGHNESS = 0.032  # the principled BSDF clamps its GGX width α = roughness² at 0.001
 
 
@@ -46,7 +46,7 @@ def roughness_nodes() -> np.ndarray:
 def specular_nodes() -> np.ndarray:
     """Return the values of specular at the tables of dielectrics, [SPECULARS]: quadratic, since what grazing angles reflect bends
     near 0."""
-    return np.linspace(_LEAST, _MOST, SPECULARS) ** 2
+    return np.linspace(0, _MOST, SPECULARS) ** 2
 
 
 def specular_of(eta: float) -> float:
@@ -114,7 +114,7 @@ def albedos(cosine: "mi.Float", roughness: "mi.Float", tables: "Sequence[mi.UInt
 
 def dielectric(cosine: "mi.Float", roughness: "mi.Float", specular: "mi.Float") -> "mi.Float":
     """Return E_dielectric of (4) for ``specular`` of (22), in which it is differentiable, too."""
-    position = (dr.sqrt(specular) - _LEAST) / (_MOST - _LEAST) * (SPECULARS - 1)
+    position = dr.sqrt(specular) / _MOST * (SPECULARS - 1)
     below = dr.clip(mi.Int32(dr.detach(position)), 0, SPECULARS - 2)
     lower, upper = albedos(cosine, roughness, [mi.UInt32(below), mi.UInt32(below + 1)])
     return dr.lerp(lower, upper, position - mi.Float(below))

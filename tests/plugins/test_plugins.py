@@ -196,6 +196,7 @@ def test_variants(ply):
         ('<string name="filenam" value="x.ply"/>', "filenam"),
         ('<string name="filename" value="absent.ply"/>', "absent.ply: can't be read"),
         ('<bsdf type="diffuse"/>', "surfels need 'principled'"),
+        ('<bsdf type="principled"><float name="eta" value="3.5"/></bsdf>', "eta 3.5 is not one of surfels"),
         ('<transform name="to_world"><scale value="2"/></transform>', "'to_world' is not supported"),
     ],
 )

@@ -45,12 +45,12 @@ def test_shipped_albedos_are_those_of_the_plugin():
     """Also between the nodes of specular."""
     nodes = tables.specular_nodes()
     between = ((np.sqrt(nodes[:-1]) + np.sqrt(nodes[1:])) / 2) ** 2
-    expected = tables.integrated(between[1::5])
+    expected = tables.integrated(between[4::5])
     cosines, roughnesses = (
         mi.Float(v.ravel()) for v in np.meshgrid(tables.cosine_nodes(), tables.roughness_nodes(), indexing="ij")
     )
     shape = tables.COSINES, tables.ROUGHNESSES
-    for specular, table in zip(between[1::5], expected):
+    for specular, table in zip(between[4::5], expected):
         found = tables.dielectric(cosines, roughnesses, mi.Float(specular)).numpy().reshape(shape)
         np.testing.assert_allclose(found, table, rtol=0.012, atol=3e-4)
     for k, table in zip((tables.BLACK, tables.WHITE, tables.DIFFUSE), expected[-3:]):
