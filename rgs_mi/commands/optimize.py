@@ -192,7 +192,8 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
     def fit_of(shown: Dataset, settings: Settings) -> Fit:
         positions, normals, colors, spacing = points
         shading = _shading(scene, settings, dataset)
-        learns_specular = shading.specular == "split_sum" and any(settings.learning_rates.specular)
+        specular = specular_of(shading.eta)  # what it can't say, η from 1.79 on, stays as the scene has it
+        learns_specular = shading.specular == "split_sum" and any(settings.learning_rates.specular) and specular < 1
         center = shading.turntable.point if shading.turntable else middle  # a room turns about its center
         model = Model.start(
             positions,
@@ -209,7 +210,7 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
             settings.shader,
             two_sided=None if box is None else True,
             room=(center, settings.room * extent) if settings.room else None,
-            specular=specular_of(shading.eta) if learns_specular else None,
+            specular=specular if learns_specular else None,
         )
         fit = Fit(shown, model, settings, extent, shading, _priors(shown, settings))
         if fit.cameras:

@@ -142,7 +142,7 @@ def _finite(value):
 def frames_per_second(
     surfels: Surfels, lighting: Lighting | None, cameras: Sequence[Camera], spp: int = 1, seconds: float = 1.0
 ) -> float:
-    """Return the median of frames per second over renderings of ``cameras`` in turn, for some ``seconds``, three at least,
+    """Return the median of frames per second over renderings of ``cameras`` in turn, for some ``seconds`` and three at least,
     with ``spp`` samples per pixel: G-buffer and shading, kernels compiled and the environment filtered beforehand."""
     spent = []
     with dr.suspend_grad():

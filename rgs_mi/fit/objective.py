@@ -99,8 +99,8 @@ class Objective:
 
     def residual(self, surfels: Surfels, lighting: Lighting, camera: Camera) -> "mi.Float":
         """Return the weighted part of the ``surfels``' diffuse radiance, as ``camera`` sees them, that is not what their base
-        color reflects under ``lighting``; of width 1. It has gradients in the base color alone: of what is no metal,
-        photographs under the light that they were taken in then show the same as without it."""
+        color reflects under ``lighting``; of width 1. It has gradients in the base color alone, on which nothing depends that
+        photographs show of what is no metal."""
         held = {name: dr.detach(getattr(surfels, name)) for name in CHANNELS if name != "base_color"}
         surfels = replace(surfels, **held).split()
         lighting = lighting.with_learned([dr.detach(v) for v in lighting.learned()], surfels)

@@ -98,7 +98,7 @@ class Schedule:
         s = self.settings
         rates = {name: self.value(getattr(s.learning_rates, _RATES[name]), progress) for name in names}
         rates["centers"] *= extent
-        if progress < s.refine_start:  # of a light that is a blur yet all walls come near, to give it shape
+        if progress < s.refine_start:  # a light that is a blur yet would take its shape from them: all walls come near
             rates |= {name: 0.0 for name in (ROOM, SPECULAR) if name in rates}
         # A light that has no shape yet would turn normals that the hull has right. Two-sided surfels began at random.
         if progress < s.normals_start and not two_sided:

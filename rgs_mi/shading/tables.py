@@ -49,9 +49,14 @@ def specular_nodes() -> np.ndarray:
     return np.linspace(0, _MOST, SPECULARS) ** 2
 
 
+def normal_reflectance(eta: float) -> float:
+    """Return F_0 of (22), what the index of refraction ``eta`` reflects at normal incidence."""
+    return ((eta - 1) / (eta + 1)) ** 2
+
+
 def specular_of(eta: float) -> float:
     """Return specular of (22) for the index of refraction ``eta``."""
-    return ((eta - 1) / (eta + 1)) ** 2 / 0.08
+    return normal_reflectance(eta) / 0.08
 
 
 def eta_of(specular: float) -> float:

@@ -190,6 +190,18 @@ def test_a_room_turns_about_its_center(tmp_path):
     assert table is not None and fit.model.center == pytest.approx(table.point, abs=1e-6)
 
 
+@pytest.mark.parametrize("eta, learned", [(1.7, True), (2.4, False)])
+def test_an_index_that_specular_can_not_say_stays(tmp_path, eta, learned):
+    scene = (find_scene("object", "scenes")).read_text()
+    material = '<bsdf type="principled" id="material"'
+    changed = scene.replace(f"{material}/>", f'{material}><float name="eta" value="{eta}"/></bsdf>')
+    (tmp_path / "object.xml").write_text(changed)
+    fitted = FitScene.load(tmp_path / "object.xml", written(tmp_path / "ball"))
+    overrides = ["light=world", "initialization.surfels=400", "initialization.compare=false"]
+    fit = start(fitted, fitted.dataset(quiet=True), fitted.settings(overrides=overrides))
+    assert (fit.model.specular() is not None) == learned and fit.shading.eta == pytest.approx(eta, abs=1e-5)
+
+
 def test_bad_settings():
     lattice = [replace(v, camera=c) for v, c in zip(capture(True).train, cameras(train_directions(2 * COUNT)))]
     with pytest.raises(UserError, match="do not stand on rings"):

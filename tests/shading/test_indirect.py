@@ -285,9 +285,8 @@ def test_share_of_diffuse_light_under_a_disc(two_sided):
         [light.with_irradiance_visibility(seed).indirect.irradiance_visibility.numpy()[:, 0] for seed in range(40)], 0
     )
     radius, height = 0.4 + 0.02, 0.5 - 0.02  # quads reach nearly two standard deviations; rays start as far above
-    share = (
-        1 if two_sided else 1 - radius**2 / (radius**2 + height**2)
-    )  # 1: where what shows from behind is hidden by nothing
+    # all of it where what shows from behind is hidden by nothing
+    share = 1 if two_sided else 1 - radius**2 / (radius**2 + height**2)
     assert irradiance_visibility[0] == pytest.approx(share, abs=1e-6 if two_sided else 0.01)
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from scipy import ndimage
 
 from ...core.arrays import as_float
+from ...shading.tables import normal_reflectance
 from ...targets.meshes import unit
 from .lookup import Seen
 from .surface import UVMesh
@@ -91,7 +92,7 @@ def textures(mesh: UVMesh, texels: Texels, seen: Seen, lit: bool, eta: float) ->
     filled = lambda values: values[near].reshape(*mesh.size[::-1], -1).astype(np.float32)
     base_color, metallic = np.clip(seen.base_color, 0, 1), np.clip(seen.metallic, 0, 1)
     if not lit:
-        base_color, metallic = metallic * base_color + (1 - metallic) * ((eta - 1) / (eta + 1)) ** 2, np.ones_like(metallic)
+        base_color, metallic = metallic * base_color + (1 - metallic) * normal_reflectance(eta), np.ones_like(metallic)
     normal = np.where(seen.known[:, None], seen.normal, texels.normals)
     return Textures(
         filled(base_color),
