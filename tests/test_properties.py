@@ -258,11 +258,11 @@ def test_starts_go_with_the_world(dataset, turn, shift, magnitude):
     world = Similarity(scale, Rotation.from_rotvec(3 * turn).as_matrix(), 1e5 * scale * shift)
     views = [replace(v, camera=replace(v.camera, to_world=world.pose(v.camera.to_world))) for v in dataset.train]
     there = recentred(Dataset(views, []))
-    expected, normals, colors, spacing = initial_points(dataset, 2000, compare=False)
+    expected, normals, spacing, look = initial_points(dataset, 2000, compare=False)
     found = initial_points(there, 2000, compare=False)
-    assert np.median(found[3]) == pytest.approx(scale * np.median(spacing), rel=0.1)
-    back = (found[0] + there.origin - world.translation) @ world.rotation / scale
+    assert np.median(found.spacing) == pytest.approx(scale * np.median(spacing), rel=0.1)
+    back = (found.positions + there.origin - world.translation) @ world.rotation / scale
     away, nearest = KDTree(back).query(expected)
     assert np.quantile(away, 0.98) < 4 * np.median(spacing)
-    facing = (normals * (found[1] @ world.rotation)[nearest]).sum(1)
-    assert np.median(facing) > 0.97 and np.median(np.abs(colors - found[2][nearest])) < 0.02
+    facing = (normals * (found.normals @ world.rotation)[nearest]).sum(1)
+    assert np.median(facing) > 0.97 and np.median(np.abs(look.color - found.appearance.color[nearest])) < 0.02

@@ -175,31 +175,30 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
     cameras = _begun_cameras(trimmed, settings, quiet)
     placed = replace(dataset, train=[replace(view, camera=cameras[view.name]) for view in trimmed])
     points = initial_points(placed, begin.surfels, settings.seed, begin.hull, begin.compare, quiet)
-    random = points[1] is None and not (dataset.points is not None and len(dataset.points))
+    random = points.normals is None and not (dataset.points is not None and len(dataset.points))
     opacity = begin.opacity or (_ANYWHERE if random else _ON_SURFACE)
     if settings.box is None and not any(view.masked for view in dataset.train):
-        box = BoundingBox.seen_by([view.camera for view in dataset.train], None if random else points[0])
+        box = BoundingBox.seen_by([view.camera for view in dataset.train], None if random else points.positions)
         settings = replace(settings, box=box.moved(dataset.origin).corners)
     box = _box(settings, dataset)
     if box is None:
-        extent = float(np.linalg.norm(points[0] - points[0].mean(0), axis=1).max())
+        extent = float(np.linalg.norm(points.positions - points.positions.mean(0), axis=1).max())
     else:
         extent = box.radius
         points = _with_surroundings(points, dataset, settings)
 
-    middle = points[0].mean(0) if box is None else box.center
+    middle = points.positions.mean(0) if box is None else box.center
 
     def fit_of(shown: Dataset, settings: Settings) -> Fit:
-        positions, normals, colors, spacing = points
         shading = _shading(scene, settings, dataset)
         specular = specular_of(shading.eta)  # what it can't say, η from 1.79 on, stays as the scene has it
         learns_specular = shading.specular == "split_sum" and any(settings.learning_rates.specular) and specular < 1
         center = shading.turntable.point if shading.turntable else middle  # a room turns about its center
         model = Model.start(
-            positions,
-            normals,
-            colors,
-            spacing,
+            points.positions,
+            points.normals,
+            points.appearance.diffuse,
+            points.spacing,
             scene.environment.texels.numpy(),
             scene.environment.rotation,
             settings.sh_order,
@@ -207,6 +206,7 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
             begin.scale,
             opacity,
             begin.roughness,
+            points.appearance.metallic,
             settings.shader,
             two_sided=None if box is None else True,
             room=(center, settings.room * extent) if settings.room else None,
@@ -239,12 +239,12 @@ def _begun_cameras(views, settings, quiet) -> dict[str, Camera]:
 
 def _with_surroundings(points, dataset, settings):
     """`initial_points` of the object and whatever else photographs show, and those of what lies farther away."""
-    positions, normals, colors, spacing = points
+    normals = points.normals
     if normals is None:
-        normals = np.random.default_rng((settings.seed, 2)).normal(size=positions.shape)
-    near = positions, normals / np.linalg.norm(normals, axis=1, keepdims=True), colors, spacing
-    far: tuple = surroundings(dataset, settings.initialization.surroundings, settings.seed)
-    return tuple(np.concatenate(pair) for pair in zip(near, far))
+        normals = np.random.default_rng((settings.seed, 2)).normal(size=points.positions.shape)
+        normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    far = surroundings(dataset, settings.initialization.surroundings, settings.seed)
+    return points._replace(normals=normals.astype(np.float32)).joined_with(far)
 
 
 def _shading(scene, settings, dataset):

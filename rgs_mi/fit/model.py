@@ -71,7 +71,7 @@ class Model:
         cls,
         positions: np.ndarray,
         normals: np.ndarray | None,
-        colors: np.ndarray,
+        diffuse: np.ndarray,
         spacing: np.ndarray,
         environment: np.ndarray,
         rotation: np.ndarray,
@@ -80,6 +80,7 @@ class Model:
         scale: float = 1.0,
         opacity: float = 0.7,
         roughness: float = 0.3,
+        metallic: np.ndarray | float = 0.4,
         shader: str = "identity",
         two_sided: bool | None = None,
         room: tuple[np.ndarray | Sequence[float], float] | None = None,
@@ -90,11 +91,11 @@ class Model:
         Args:
           positions:   [N, 3] centers of the surfels, world space
           normals:     [N, 3] what they face, unit vectors (None: random ones)
-          colors:      [N, 3] their diffuse radiance, linear
+          diffuse:     [N, 3] their diffuse radiance, linear
           spacing:     [N] distances to their neighbors; ``scale`` times these are their standard deviations
           environment: [rows, columns, 3] linear radiance; ``rotation`` [3, 3] takes its frame to the world's
           sh_order:    order of the spherical harmonics
-          opacity, roughness: of all surfels
+          opacity, roughness, metallic: of all surfels; metallic may be [N], of each
           shader:      'identity' or 'mlp', as in `Settings`
           two_sided:   see `Surfels` (None: where normals are random; others point outwards)
           room:        center and distance of the walls on which the environment is painted (None: it is at infinity)
@@ -115,11 +116,11 @@ class Model:
                 "rotations": rotation_from_normal(facing, rng.uniform(0, 2 * np.pi, n)),
                 "log_scales": np.log(scale * np.repeat(spacing[:, None], 2, 1)),
                 "logit_opacities": np.full((n, 1), logit(opacity)),
-                "sh_dc": (0.5 * colors - 0.5) / SH_0,
+                "sh_dc": (diffuse - 0.5) / SH_0,
                 "sh_rest": np.zeros((n, 3 * ((sh_order + 1) ** 2 - 1))),
                 "logit_base_color": np.full((n, 3), logit(0.5)),
                 "logit_roughness": np.full((n, 1), logit(roughness)),
-                "logit_metallic": np.full((n, 1), logit(0.4)),
+                "logit_metallic": np.broadcast_to(logit(metallic), n)[:, None],
                 "delta_normal": np.zeros((n, 3)),
                 "curvature": np.zeros((n, 3)),
                 ENVIRONMENT: np.log(np.maximum(environment, 1e-3)),

@@ -27,6 +27,7 @@ _RATES = {
     ROOM: "room",
     SPECULAR: "specular",
 }
+_RELIT = ("logit_base_color", "logit_metallic")  # what photographs tell best while surfels are lit
 _NORMALS, _HELD = ("rotations", "delta_normal", "curvature"), 0.1  # the part of their rates that they have at first
 # A mirror ball, its radius r 3/8 of the picture, turns what its middle reflects by 2/r a pixel: π r/2 rows are told apart
 _ROWS_A_PIXEL, _MOST_ROWS = 3 * np.pi / 16, 512
@@ -81,10 +82,19 @@ class Schedule:
 
     def explains(self, progress: float) -> bool:
         """Return whether base colors are held to explain the surfels' own diffuse radiance by then, so that it can be relit: once
-        they reflect each other, as far as the light is not sampled, which has noise."""
+        they reflect each other, and until photographs themselves are explained (`relights`)."""
+        s = self.settings
+        return s.weights.residual > 0 and s.indirect_start <= progress < s.relit[0] and self._relightable(progress)
+
+    def relights(self, progress: float) -> bool:
+        """Return whether a step sees the surfels as another light would show them: lit, their own radiance put aside."""
+        s = self.settings
+        return s.relit[0] <= progress < s.relit[1] and self._relightable(progress)
+
+    def _relightable(self, progress):
+        """Whether base colors are to be what another light would show, and nothing samples the light, which has noise."""
         shading = self.shading(progress)
-        wanted = shading.diffuse == "relightable" and self.settings.weights.residual > 0
-        return wanted and shading.specular == "split_sum" and progress >= self.settings.indirect_start
+        return shading.diffuse == "relightable" and shading.specular == "split_sum"
 
     def value(self, pair: tuple[float, float], progress: float) -> float:
         """Of a (first, last) ``pair``: geometrically between them, linearly from or to zero."""
@@ -103,6 +113,8 @@ class Schedule:
         # A light that has no shape yet would turn normals that the hull has right. Two-sided surfels began at random.
         if progress < s.normals_start and not two_sided:
             rates |= {name: _HELD * rates[name] for name in _NORMALS}
+        if s.relit[0] < s.relit[1] <= progress and self._relightable(progress):
+            rates |= {name: 0.0 for name in _RELIT}  # the radiance makes up for what these have become
         return {name: rate * self._cooled(progress) for name, rate in rates.items()}
 
     def camera_rates(self, progress: float, pixel: float) -> dict[str, float]:

@@ -167,12 +167,18 @@ class Fit:
         shading = self.schedule.shading(self.progress)
         return replace(shading, turntable=self.turns.table) if self.turns else shading
 
+    @property
+    def _shading_of_steps(self):
+        """`_shading` as the steps that are due have it."""
+        shading = self._shading
+        return replace(shading, diffuse="lit") if self.schedule.relights(self.progress) else shading
+
     # ---- Lighting ----
 
     def lighting(self, surfels: Surfels, training: bool = False) -> Lighting | None:
         """How the model's ``surfels`` are shaded by now; None where nothing is specular. ``training``: as a step has it,
         with what reflected rays meet, and the light's sampling, of some steps ago."""
-        shading = self._shading if training else self.shading
+        shading = self._shading_of_steps if training else self.shading
         if shading.specular == "none":
             return None
         shader, sampled = self.model.shader(), shading.specular == "monte_carlo"
@@ -195,7 +201,7 @@ class Fit:
 
     def _refresh(self, surfels):
         """Rebuild what serves many steps."""
-        shading, due = self._shading, self.step_number % _REBUILD == 0
+        shading, due = self._shading_of_steps, self.step_number % _REBUILD == 0
         sampled = shading.specular == "monte_carlo"
         if due or self.emitter is None:
             self.emitter = self.model.environment().emitter() if sampled else None
@@ -212,7 +218,7 @@ class Fit:
     def _hidden(self, surfels):
         """What ``surfels`` hide of the light; None where nothing asks."""
         self.irradiance_visibility = None
-        explained = self._shading.diffuse == "lit" or self.schedule.explains(self.progress)
+        explained = self.schedule.explains(self.progress) or self._shading_of_steps.diffuse == "lit"
         lighting = self.lighting(surfels, training=True) if self.proxies and explained else None
         if lighting is None:
             return None

@@ -1,14 +1,16 @@
 """Where the first surfels stand: on the visual hull, where photographs agree on a depth, on a sparse point cloud, or anywhere in
 view."""
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy import spatial
 
 from ..core.camera import focus_point
-from ..core.color import srgb_decode
 from ..datasets.types import Dataset
 from . import hull, stereo
 from .openings import COPIES, openings, seen_through
+from .photometric_variation import Appearance, appearance
 from .sampling import sample_surface
 from .surface_points import oriented_points
 
@@ -16,26 +18,34 @@ _FAR = 10
 _DEEPER = 2  # area of what lies below the hull, over that of the hull that is seen through
 _A_WRONG_MASK = 32  # in so many photographs one mask may be wrong at any point
 _FEW = 0.1  # of the points that are wanted: fewer that photographs agree on are no start
-_SRGB_TO_LINEAR = srgb_decode(np.arange(256) / 255).astype(np.float32)
 
 
-#: Positions [N, 3], unit normals [N, 3] or None, linear colours [N, 3], and distances to neighbours [N].
-Points = tuple[np.ndarray, np.ndarray | None, np.ndarray, np.ndarray]
+class Points(NamedTuple):
+    """Where surfels start: ``positions`` [N, 3] and unit ``normals`` [N, 3] (None: points of no surface), world space;
+    ``spacing`` [N], the mean distance to the three nearest neighbours (at least 1e-7); and their ``appearance``. All float32."""
+
+    positions: np.ndarray
+    normals: np.ndarray | None
+    spacing: np.ndarray
+    appearance: Appearance
+
+    def joined_with(self, others: "Points") -> "Points":
+        """Return these points and ``others``."""
+        assert self.normals is not None and others.normals is not None, "either both are on surfaces or none"
+        joined = (np.concatenate(pair) for pair in zip(self[:3], others[:3]))
+        return Points(*joined, Appearance(*map(np.concatenate, zip(self.appearance, others.appearance))))
 
 
 def initial_points(
     dataset: Dataset, count: int, seed: int = 0, on_hull: bool = True, compare: bool = True, quiet: bool = True
 ) -> Points:
-    """Return the starting points of a fit to ``dataset.train``, world space, all float32 (docs/method.md §5).
+    """Return the starting points of a fit to ``dataset.train`` (docs/method.md §5).
 
     Where images have masks and ``on_hull`` is set, ``count`` points on the visual hull (of photographs' masks few are
     outvoted); with ``compare`` less those that
     photographs look through, plus what they agree on below it. Where they have none, about ``count`` points that photographs
     agree on, with ``compare``; else, or where these are few, ``dataset.points`` (a random ``count`` of them where there are
     more), else ``count`` points at random in the ball that the cameras look into. ``quiet``: no progress.
-
-    Returns: positions [N, 3]; unit normals [N, 3], or None for points without a surface; linear colours [N, 3], the mean of the
-    photographs that see the point; spacing [N], the mean distance to the three nearest neighbours (at least 1e-7).
     """
     rng, views = np.random.default_rng(seed), dataset.train
     if any(view.masked for view in views):
@@ -45,12 +55,13 @@ def initial_points(
         maps = stereo.verified(stereo.depth_maps(views, quiet=quiet))
         positions, normals = oriented_points(maps, count, rng)
         if len(positions) > _FEW * count:
-            return positions, normals, _colors(positions, views, _seen_in(maps, views)), _spacing(positions)
+            return Points(positions, normals, _spacing(positions), appearance(positions, views, _seen_in(maps, views)))
     if dataset.points is not None and len(dataset.points):
         chosen = np.sort(rng.permutation(len(dataset.points))[:count])
         positions = np.asarray(dataset.points, np.float32)[chosen]
         if dataset.point_colors is not None:
-            return positions, None, np.asarray(dataset.point_colors, np.float32)[chosen], _spacing(positions)
+            colors = np.asarray(dataset.point_colors, np.float32)[chosen]
+            return Points(positions, None, _spacing(positions), Appearance.of(colors))
     else:
         center, reach = focus_point([view.camera for view in views])
         # Half a frame's extent at the center, for the typical camera: inside that ball all of them see something.
@@ -58,7 +69,7 @@ def initial_points(
         ball = rng.normal(size=(count, 3))
         ball *= rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1, keepdims=True)
         positions = (center + reach * min(half, 1.0) * ball).astype(np.float32)
-    return positions, None, _colors(positions, views), _spacing(positions)
+    return Points(positions, None, _spacing(positions), _unhidden(positions, views))
 
 
 def _on_hull(views, count, rng, compare, outvoted, quiet) -> Points:
@@ -78,11 +89,16 @@ def _on_hull(views, count, rng, compare, outvoted, quiet) -> Points:
     depths = hull.depth_maps(*mesh[:2], [view.camera for view in views])
     reach = 2 * float(np.median(spacing))
     seen = lambda index, z, column, row: z < depths[index][row, column] + reach  # NaN: nothing is there
-    return positions, normals, _colors(positions, views, seen), spacing
+    return Points(positions, normals, spacing, appearance(positions, views, seen))
+
+
+def _unhidden(positions, views) -> Appearance:
+    """The mean color of points that may hide each other, which tells nothing of how one of them varies."""
+    return Appearance.of(appearance(positions, views, lambda *_: True).color)
 
 
 def _seen_in(maps, views):
-    """Which points their ``maps`` have, for `_colors` of the ``views``: no others, before or behind."""
+    """Which points their ``maps`` have, for the `appearance` in the ``views``: no others, before or behind."""
 
     def seen(index, z, column, row):
         m, size = maps[index], views[index].camera.size
@@ -99,7 +115,7 @@ def surroundings(dataset: Dataset, count: int, seed: int = 0) -> Points:
     outward = np.random.default_rng((seed, 1)).normal(size=(count, 3))
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     positions = (center + _FAR * reach * outward).astype(np.float32)
-    return positions, -outward, _colors(positions, dataset.train), _spacing(positions)
+    return Points(positions, -outward.astype(np.float32), _spacing(positions), _unhidden(positions, dataset.train))
 
 
 def _spacing(positions: np.ndarray) -> np.ndarray:
@@ -109,27 +125,3 @@ def _spacing(positions: np.ndarray) -> np.ndarray:
         return np.ones(len(positions), np.float32)
     distance, _ = spatial.KDTree(positions).query(positions, neighbours + 1, workers=-1)
     return np.maximum(distance[:, 1:].mean(1), 1e-7).astype(np.float32)
-
-
-def _colors(positions, views, sees=lambda *_: True) -> np.ndarray:
-    """[N, 3] mean linear colour of ``positions`` over the views that see them: ``sees(index of a view, z-depths, columns, rows)``
-    says which. Points that no view sees take the mean of all the others, or grey.
-    """
-    total = np.zeros((len(positions), 3), np.float32)
-    weight = np.zeros(len(positions), np.float32)
-    for index, view in enumerate(views):
-        pixel, z = view.camera.project(positions)
-        width, height = view.camera.size
-        seen = np.flatnonzero((z > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < width) & (pixel[:, 1] < height))
-        column, row = pixel[seen].astype(np.int64).T
-        rgba = view.pixels[row, column]
-        if view.pixels.dtype == np.uint8:
-            rgb, alpha = _SRGB_TO_LINEAR[rgba[:, :3]], rgba[:, 3] / np.float32(255)
-        else:
-            rgb, alpha = rgba[:, :3], rgba[:, 3]
-        alpha = np.where(sees(index, z[seen], column, row), alpha, 0)
-        total[seen] += rgb * alpha[:, None]
-        weight[seen] += alpha
-    known = weight > 0
-    fill = total[known].sum(0) / weight[known].sum() if known.any() else np.full(3, 0.5, np.float32)
-    return np.where(known[:, None], total / np.maximum(weight, 1e-12)[:, None], fill).astype(np.float32)

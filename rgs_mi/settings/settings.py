@@ -13,6 +13,8 @@ _MODEL = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 #: A learning rate at the beginning and at the end, joined geometrically.
 Rates = tuple[Annotated[float, Field(ge=0, le=10)], Annotated[float, Field(ge=0, le=10)]]
+#: A part of the fit.
+Fraction = Annotated[float, Field(ge=0, le=1)]
 #: A weight at the beginning and at the end, joined geometrically.
 WeightPair = tuple[Annotated[float, Field(ge=0, le=1e3)], Annotated[float, Field(ge=0, le=1e3)]]
 
@@ -272,6 +274,12 @@ class Settings:
     )
     indirect_start: float = Field(
         default=0.1, ge=0, le=1, description="Fraction of the fit from which those rays are traced."
+    )
+    relit: tuple[Fraction, Fraction] = Field(
+        default=(1.0, 1.0),
+        description="Fractions of the fit from and until which photographs are explained by what base colours reflect, where "
+        "the integrator's `diffuse` is `relightable`; afterwards base colours and metallic stay. 0.87, 0.95: other lights gain "
+        "half a decibel, their own loses 0.2; 1, 1: never.",
     )
     monte_carlo_start: float = Field(
         default=0.8,

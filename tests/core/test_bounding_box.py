@@ -126,7 +126,7 @@ def test_in_scenes():
 
 
 def test_surroundings():
-    positions, normals, colors, spacing = surroundings(photographs(), 300)
+    positions, normals, spacing, (colors, *_) = surroundings(photographs(), 300)
     distance = np.linalg.norm(positions, axis=1)
     assert (distance > 30).all() and (distance < 60).all()
     assert ((positions * normals).sum(1) < 0).all() and (spacing > 1).all()

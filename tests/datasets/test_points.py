@@ -263,7 +263,7 @@ def test_photographs_without_masks_start_at_the_points(tmp_path, kind):
     np.testing.assert_array_equal(data.points, XYZ)
     assert (data.point_colors is None) == (kind is None) and not any(view.masked for view in data.train)
 
-    positions, normals, colors, spacing = initial_points(data, 100)
+    positions, normals, spacing, (colors, *_) = initial_points(data, 100)
     np.testing.assert_array_equal(positions, XYZ)
     assert normals is None and all(a.dtype == np.float32 for a in (positions, colors, spacing))
     seen = np.broadcast_to(srgb_decode(np.array([128, 64, 32]) / 255), (4, 3))
@@ -271,7 +271,7 @@ def test_photographs_without_masks_start_at_the_points(tmp_path, kind):
     distance = np.linalg.norm(XYZ[:, None] - XYZ, axis=-1)
     np.testing.assert_allclose(spacing, distance.sum(1) / 3, rtol=1e-5)
 
-    fewer, _, colors, _ = initial_points(data, 2)
+    fewer, _, _, (colors, *_) = initial_points(data, 2)
     rows = [np.flatnonzero((XYZ == point).all(1))[0] for point in fewer]
     assert len(set(rows)) == 2
     np.testing.assert_allclose(colors, LINEAR[rows] if kind else seen[:2], rtol=1e-5, atol=1e-6)
@@ -279,10 +279,10 @@ def test_photographs_without_masks_start_at_the_points(tmp_path, kind):
 
 def test_points_at_one_place_and_a_lone_one_have_a_spacing(tmp_path):
     file = ply(capture(tmp_path, "RGBA") / "points3d.ply", xyz=0 * XYZ)  # opaque alpha is no mask
-    assert (initial_points(load_dataset(tmp_path), 100)[3] > 0).all()
+    assert (initial_points(load_dataset(tmp_path), 100).spacing > 0).all()
     file.unlink()
     file.with_name("points3D.txt").write_text("1 0 0 0 255 255 255 0")
-    positions, _, colors, spacing = initial_points(load_dataset(tmp_path), 100)
+    positions, _, spacing, (colors, *_) = initial_points(load_dataset(tmp_path), 100)
     assert positions.shape == (1, 3) and (colors == 1).all() and np.isfinite(spacing).all()
 
 

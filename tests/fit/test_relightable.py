@@ -13,6 +13,7 @@ from rgs_mi.datasets.types import Dataset, View
 from rgs_mi.fit import losses
 from rgs_mi.fit.model import Model, logit
 from rgs_mi.fit.objective import Objective
+from rgs_mi.fit.schedule import Schedule
 from rgs_mi.fit.trainer import Fit
 from rgs_mi.settings.settings import LearningRates
 from rgs_mi.shading import deferred, tables
@@ -101,6 +102,29 @@ def test_base_colors_are_found_beside_the_radiance():
         psnr[diffuse] = fit.psnr
     assert errors["relightable"] < 0.04 < 0.15 < errors["radiance"]
     assert min(psnr.values()) > 45
+
+
+@pytest.mark.parametrize(
+    "diffuse, relit, specular",
+    [
+        ("relightable", (0.8, 0.95), "split_sum"),
+        ("relightable", (1.0, 1.0), "split_sum"),
+        ("relightable", (0.8, 0.95), "monte_carlo"),
+    ]
+    + [(diffuse, (0.8, 0.95), "split_sum") for diffuse in ("radiance", "lit")],
+)
+def test_surfels_are_lit_towards_the_end(diffuse, relit, specular):
+    """Once, and then what base colors and metals are is settled; where there is a radiance, and no samples."""
+    settings = replace(SETTINGS, relit=relit, indirect_start=0.1, monte_carlo_start=0.7)
+    schedule = Schedule.of(settings, Shading(diffuse=diffuse, specular=specular))
+    explained = diffuse == "relightable" and specular == "split_sum"
+    once = explained and relit[0] < 1
+    assert schedule.explains(0.5) == (diffuse == "relightable") and not schedule.explains(0.05)
+    assert [schedule.explains(p) for p in (0.75, 0.9, 0.97)] == [explained, explained > once, explained > once]
+    assert [schedule.relights(p) for p in (0.5, 0.79, 0.81, 0.94, 0.96)] == [False, False, once, once, False]
+    names = ("centers", "logit_base_color", "logit_metallic")
+    moving = [[rate > 0 for rate in schedule.learning_rates(names, p, 1.0, False).values()] for p in (0.9, 0.97)]
+    assert moving == [[True] * 3, [True, not once, not once]]
 
 
 def test_what_no_metal_reflects_is_found():

@@ -242,11 +242,13 @@ def test_no_masks_and_no_common_volume(data):
 
 
 def test_initial_points_from_masks(data):
-    positions, normals, colors, spacing = initial_points(data, 1500, 0)
-    assert positions.shape == normals.shape == colors.shape == (1500, 3) and spacing.shape == (1500,)
+    positions, normals, spacing, look = initial_points(data, 1500, 0)
+    assert positions.shape == normals.shape == look.color.shape == (1500, 3) and spacing.shape == (1500,)
     assert np.linalg.norm(positions - CENTRE, axis=1).mean() == pytest.approx(RADIUS, rel=0.02)
     linear = ((RGB / 255 + 0.055) / 1.055) ** 2.4
-    np.testing.assert_allclose(colors, np.broadcast_to(linear, colors.shape), atol=1e-4)
+    for color in (look.color, look.lasting):
+        np.testing.assert_allclose(color, np.broadcast_to(linear, color.shape), atol=1e-4)
+    assert np.abs(look.variation).max() < 1e-6  # one colour from wherever one looks
     assert spacing.mean() == pytest.approx(np.sqrt(4 * np.pi * RADIUS**2 / 1500), rel=0.3)
 
 
@@ -257,18 +259,18 @@ def test_hidden_views_do_not_colour_a_point(data):
         pixels = v.pixels.copy()
         pixels[..., :3] = 255 * (v.camera.origin[2] > CENTRE[2])
         views.append(View(v.name, v.camera, pixels, True, None, v.path))
-    positions, _, colors, _ = initial_points(Dataset(views, []), 1000, 0)
+    positions, _, _, (colors, *_) = initial_points(Dataset(views, []), 1000, 0)
     height = (positions[:, 2] - CENTRE[2]) / RADIUS
     assert colors[height > 0.9].mean() > 0.85 and colors[height < -0.9].mean() < 0.15
 
 
 def test_initial_points_without_masks(data):
     bare = [View(v.name, v.camera, v.pixels, False, None, v.path) for v in data.train]
-    positions, normals, colors, spacing = initial_points(Dataset(bare, []), 500, 0)
+    positions, normals, spacing, (colors, *_) = initial_points(Dataset(bare, []), 500, 0)
     assert normals is None and np.isfinite(colors).all() and (spacing > 0).all()
     assert np.linalg.norm(positions.mean(0) - CENTRE) < 0.1
     cloud = np.random.default_rng(0).random((300, 3))
-    positions, normals, colors, _ = initial_points(Dataset(bare, [], cloud, cloud), 200, 0)
+    positions, normals, _, (colors, *_) = initial_points(Dataset(bare, [], cloud, cloud), 200, 0)
     assert normals is None and positions.shape == (200, 3)
     np.testing.assert_array_equal(positions, colors)
     assert initial_points(Dataset(bare, [], cloud), 400, 0)[0].shape == (300, 3)

@@ -135,7 +135,7 @@ def test_without_masks_points_lie_on_surfaces_too():
 
 
 def test_without_masks_walls_do_not_colour_what_they_hide():
-    points, _, colors, _ = initial_points(Dataset(unmasked(textured_tray()), []), 4500)
+    points, _, _, (colors, *_) = initial_points(Dataset(unmasked(textured_tray()), []), 4500)
     floor = on_floor(*points.T)
     alone = photographs({"floor": tray(0.25)["floor"]})[0]
     column, row = alone.camera.project(points[floor])[0].astype(int).T
