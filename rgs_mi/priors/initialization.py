@@ -32,8 +32,11 @@ class Points(NamedTuple):
     def joined_with(self, others: "Points") -> "Points":
         """Return these points and ``others``."""
         assert self.normals is not None and others.normals is not None, "either both are on surfaces or none"
-        joined = (np.concatenate(pair) for pair in zip(self[:3], others[:3]))
-        return Points(*joined, Appearance(*map(np.concatenate, zip(self.appearance, others.appearance))))
+        positions = np.concatenate([self.positions, others.positions])
+        normals = np.concatenate([self.normals, others.normals])
+        spacing = np.concatenate([self.spacing, others.spacing])
+        look = (np.concatenate(pair) for pair in zip(self.appearance, others.appearance))
+        return Points(positions, normals, spacing, Appearance._make(look))
 
 
 def initial_points(

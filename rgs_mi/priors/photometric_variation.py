@@ -58,7 +58,7 @@ def appearance(
     known = weight > 0
     fill = total[known].sum(0) / weight[known].sum() if known.any() else np.full(3, 0.5, np.float32)
     color = np.where(known[:, None], total / np.maximum(weight, 1e-12)[:, None], fill)
-    return Appearance(*(v.astype(np.float32) for v in (color, lasting, variation)))
+    return Appearance._make(v.astype(np.float32) for v in (color, lasting, variation))
 
 
 def _observed(positions, views, sees):
