@@ -27,7 +27,10 @@ _RATES = {
     ROOM: "room",
     SPECULAR: "specular",
 }
-_RELIT = ("logit_base_color", "logit_metallic")  # what photographs tell best while surfels are lit
+_RADIANCE, _RELIT = (
+    ("sh_dc", "sh_rest"),
+    ("logit_base_color", "logit_metallic"),
+)  # what lit surfels show nothing of, and most
 _NORMALS, _HELD = ("rotations", "delta_normal", "curvature"), 0.1  # the part of their rates that they have at first
 # A mirror ball, its radius r 3/8 of the picture, turns what its middle reflects by 2/r a pixel: π r/2 rows are told apart
 _ROWS_A_PIXEL, _MOST_ROWS = 3 * np.pi / 16, 512
@@ -113,8 +116,12 @@ class Schedule:
         # A light that has no shape yet would turn normals that the hull has right. Two-sided surfels began at random.
         if progress < s.normals_start and not two_sided:
             rates |= {name: _HELD * rates[name] for name in _NORMALS}
-        if s.relit[0] < s.relit[1] <= progress and self._relightable(progress):
-            rates |= {name: 0.0 for name in _RELIT}  # the radiance makes up for what these have become
+        held: tuple = ()
+        if self.relights(progress):
+            held = _RADIANCE  # Adam would go on as before
+        elif s.relit[0] < s.relit[1] <= progress and self._relightable(progress):
+            held = _RELIT  # the radiance makes up for what these have become
+        rates |= {name: 0.0 for name in held if name in rates}
         return {name: rate * self._cooled(progress) for name, rate in rates.items()}
 
     def camera_rates(self, progress: float, pixel: float) -> dict[str, float]:

@@ -11,7 +11,6 @@ from ..datasets.types import View
 
 _SRGB_TO_LINEAR = srgb_decode(np.arange(256) / 255).astype(np.float32)
 _OPAQUE = 0.99  # alpha from which a pixel shows nothing of what is behind
-
 _ENOUGH = 6  # photographs that tell how much a colour varies
 _DARK = 0.2  # linear radiance beside which a spread counts: of what is black a lamp's faint reflection is all that there is
 _HALF = 0.13  # variation at which a surface is as likely a metal as not; of the suite's it is 0.07 and 0.25 in the median
@@ -62,7 +61,7 @@ def appearance(
 
 
 def _observed(positions, views, sees):
-    """Of ``positions``: the sums of their colors and of these's weights, and `Appearance`'s lasting and variation."""
+    """Of ``positions``: the sums of their colors and of their weights, and `Appearance`'s lasting and variation."""
     count = len(positions)
     total, weight = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
     colors = np.full((len(views), count, 3), np.nan, np.float32)
@@ -71,9 +70,10 @@ def _observed(positions, views, sees):
         width, height = view.camera.size
         seen = np.flatnonzero((z > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < width) & (pixel[:, 1] < height))
         column, row = pixel[seen].astype(np.int64).T
-        rgb, alpha = view.pixels[row, column, :3], view.alpha[row, column]
-        rgb = _SRGB_TO_LINEAR[rgb] if rgb.dtype == np.uint8 else rgb
-        alpha = np.where(sees(index, z[seen], column, row), alpha, 0)
+        rgb, alpha = np.split(view.pixels[row, column], [3], 1)
+        if rgb.dtype == np.uint8:
+            rgb, alpha = _SRGB_TO_LINEAR[rgb], alpha / np.float32(255)
+        alpha = np.where(sees(index, z[seen], column, row), alpha[:, 0], 0)
         total[seen] += rgb * alpha[:, None]
         weight[seen] += alpha
         opaque = alpha > _OPAQUE

@@ -122,9 +122,23 @@ def test_surfels_are_lit_towards_the_end(diffuse, relit, specular):
     assert schedule.explains(0.5) == (diffuse == "relightable") and not schedule.explains(0.05)
     assert [schedule.explains(p) for p in (0.75, 0.9, 0.97)] == [explained, explained > once, explained > once]
     assert [schedule.relights(p) for p in (0.5, 0.79, 0.81, 0.94, 0.96)] == [False, False, once, once, False]
-    names = ("centers", "logit_base_color", "logit_metallic")
+    names = ("centers", "sh_dc", "logit_base_color", "logit_metallic")
     moving = [[rate > 0 for rate in schedule.learning_rates(names, p, 1.0, False).values()] for p in (0.9, 0.97)]
-    assert moving == [[True] * 3, [True, not once, not once]]
+    assert moving == [[True, not once, True, True], [True, True, not once, not once]]
+
+
+def test_lit_steps_move_no_radiance_and_the_last_ones_no_base_color():
+    truth = matte()
+    centers, spacing, grey = truth.numpy()["centers"], np.full(COUNT, 0.15), np.full((COUNT, 3), 0.3)
+    model = Model.start(centers, centers, grey, spacing, light(), np.eye(3), 1, opacity=0.8, roughness=0.6)
+    settings = replace(SETTINGS, iterations=6, relit=(0.3, 0.6), indirect_start=0.0)
+    fit, moved = Fit(photographs(truth), model, settings, 1.0, Shading(diffuse="relightable")), []
+    while fit.progress < 1:
+        before = {name: fit.model.numpy(name) for name in ("sh_dc", "logit_base_color", "logit_metallic")}
+        assert not fit.lighting(fit.model.surfels(0)).lit  # what a rendering of the fit shows is its radiance throughout
+        fit.step()
+        moved.append(tuple(not np.array_equal(fit.model.numpy(name), value) for name, value in before.items()))
+    assert moved == [(True, True, True)] * 2 + [(False, True, True)] * 2 + [(True, False, False)] * 2
 
 
 def test_what_no_metal_reflects_is_found():
