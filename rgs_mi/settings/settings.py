@@ -6,15 +6,24 @@ the documentation take it from here.
 
 from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import AfterValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 _MODEL = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+def _in_order(period: tuple[float, float]) -> tuple[float, float]:
+    if period[0] > period[1]:
+        raise ValueError(f"must not end before it begins; got [{period[0]:g}, {period[1]:g}]")
+    return period
+
 
 #: A learning rate at the beginning and at the end, joined geometrically.
 Rates = tuple[Annotated[float, Field(ge=0, le=10)], Annotated[float, Field(ge=0, le=10)]]
 #: A part of the fit.
 Fraction = Annotated[float, Field(ge=0, le=1)]
+#: From which to which part of the fit.
+Period = Annotated[tuple[Fraction, Fraction], AfterValidator(_in_order)]
 #: A weight at the beginning and at the end, joined geometrically.
 WeightPair = tuple[Annotated[float, Field(ge=0, le=1e3)], Annotated[float, Field(ge=0, le=1e3)]]
 
@@ -275,11 +284,11 @@ class Settings:
     indirect_start: float = Field(
         default=0.1, ge=0, le=1, description="Fraction of the fit from which those rays are traced."
     )
-    relit: tuple[Fraction, Fraction] = Field(
-        default=(1.0, 1.0),
+    relit: Period = Field(
+        default=(0.82, 0.9),
         description="Fractions of the fit from and until which photographs are explained by what base colours reflect, where "
-        "the integrator's `diffuse` is `relightable`; afterwards base colours and metallic stay. 0.87, 0.95: other lights gain "
-        "half a decibel, their own loses 0.2; 1, 1: never.",
+        "the integrator's `diffuse` is `relightable`; afterwards base colours and metallic stay, and the radiance makes up for "
+        "it. 1, 1: never.",
     )
     monte_carlo_start: float = Field(
         default=0.8,

@@ -240,9 +240,16 @@ def test_learning_rates_have_bounds(value):
             load_config(settings.Settings, overrides=[f"{name}={value}"])
 
 
+def test_a_period_ends_after_it_begins():
+    assert load_config(settings.Settings, overrides=["relit=[0.5,0.5]"]).relit == (0.5, 0.5)
+    with pytest.raises(UserError, match=r"--set relit=.*: 'relit': must not end before it begins; got \[0.9, 0.8\]"):
+        load_config(settings.Settings, overrides=["relit=[0.9,0.8]"])
+
+
 def test_the_kinds_in_words():
     known = {setting.key: setting for setting in fields.walk(settings.Settings)}
     assert known["minutes"].kind == "a number or null" and known["minutes"].range == "between 0.01 and 100000"
     assert known["learning_rates.centers"].kind == "a list of 2 numbers"
+    assert known["relit"].kind == "a list of 2 numbers" and known["relit"].range == "between 0 and 1"
     assert known["learning_rates.centers"].default == "[0.0005, 1e-05]"
     assert known["stages"].kind == "a list of mappings or null" and known["stages"].default == "null"
