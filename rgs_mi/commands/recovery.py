@@ -8,10 +8,12 @@ lights. What `rgs-mi recovery` calls.
                             nothing of the object lies in between, and as blurred as their roughness sees it
     roughness_mae, metallic_mae, base_color_mae    means over the pixels that the object fills; the base colour up to a
                             factor a channel, which light can take over
+    base_color_factor, base_color_mae_unaligned    those factors, and the mean without them
     relit                   name -> mean psnr and ssim of the fit under that light, as it is
 """
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import drjit as dr
@@ -45,6 +47,7 @@ def recovery(
     ground_truth_scene: str | Path,
     lights: Sequence[str] = (),
     *,
+    variables: Mapping[str, object] | None = None,
     size: int = 400,
     out: str | Path | None = None,
     quiet: bool = False,
@@ -53,6 +56,7 @@ def recovery(
     environments of the suite; write the module's files and return what recovery.json holds.
 
     Args:
+      variables: of that scene file, as its photographs have them
       size: pixels along a side of the path-traced views, which are kept in the `cache_folder`
       out:  folder (None: ``recovery`` in ``run``)
 
@@ -61,14 +65,15 @@ def recovery(
     run, true_path = Path(run), Path(ground_truth_scene)
     out = Path(out) if out else run / "recovery"
     path = run / SCENE
-    scene, true_scene = load_scene(path, {}), load_scene(true_path, {})
+    variables = dict(variables or {})
+    scene, true_scene = load_scene(path, {}), load_scene(true_path, variables)
     surfels_of(scene, path)
-    own = _views(true_path, {}, size, quiet)
+    own = _views(true_path, variables, size, quiet)
     figures: dict = _materials(scene, path, own)
     relit_scores = {}
     figures["environment_log_rmse"] = _environment(scene, true_scene, own)
     for light in lights:
-        views = _views(true_path, {"environment": light}, size, quiet)
+        views = _views(true_path, variables | {"environment": light}, size, quiet)
         relit = load_scene(path, {})
         relight(relit, path, light)
         relit_scores[light] = _compare(relit, views, out / f"relit_{light}.png")
@@ -79,7 +84,8 @@ def recovery(
 
 def _views(path, variables, size, quiet):
     """Path-traced views of the scene file ``path`` with its light, or another."""
-    folder = cache_folder("-".join([path.stem, "truth", *variables.values()]))
+    name = "-".join([path.stem, "truth", *map(str, variables.values())])
+    folder = cache_folder(re.sub(r"[^\w-]+", "_", name))
     render_dataset(path, folder, train=1, test=_VIEWS, size=size, variables=variables, quiet=quiet)
     return load_dataset(folder).test
 
@@ -133,6 +139,7 @@ def _materials(scene, path, views):
     return {f"{name}_mae": float(np.mean(e)) for name, e in errors.items()} | {
         "base_color_mae": float(abs(ours * factor - true).mean()),
         "base_color_factor": factor.tolist(),
+        "base_color_mae_unaligned": float(abs(ours - true).mean()),
     }
 
 

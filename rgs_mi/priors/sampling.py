@@ -4,6 +4,7 @@ import numpy as np
 from scipy import spatial
 
 _BEND, _DENSER = 0.3, 4  # difference of unit normals from sample to sample that is too much; how much denser samples may be
+_CHUNK = 100_000  # points that are asked for their neighbours at a time: memory
 
 
 def sample_surface(
@@ -44,10 +45,9 @@ def _bend(faces, normals, area):
 def thinned(positions: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Return the indices of a Poisson-disk subset of ``positions`` [N, 3], no two of which are nearer than the smaller of
     their ``radius`` [N]. It is made in rounds: a point stays when no remaining neighbour comes before it."""
-    near = spatial.KDTree(positions).query_ball_point(positions, radius, workers=-1)
-    a, b = np.repeat(np.arange(len(near)), [len(n) for n in near]), np.concatenate(near).astype(np.intp)
-    close = (a < b) & (np.linalg.norm(positions[a] - positions[b], axis=1) < radius[b])  # the index is the order
-    a, b = a[close], b[close]
+    tree, indices = spatial.KDTree(positions), np.arange(len(positions), dtype=np.int32)
+    chunks = np.array_split(indices, -(-len(indices) // _CHUNK) or 1)
+    a, b = np.concatenate([_close(tree, positions, radius, chunk) for chunk in chunks], 1)
     state = np.zeros(len(positions), np.int8)  # 0 open, 1 kept, -1 removed
     while (state == 0).any():
         held = np.zeros(len(positions), bool)
@@ -57,3 +57,13 @@ def thinned(positions: np.ndarray, radius: np.ndarray) -> np.ndarray:
         open_ = (state[a] == 0) & (state[b] == 0)
         a, b = a[open_], b[open_]
     return np.flatnonzero(state == 1)
+
+
+def _close(tree, positions, radius, chunk):
+    """[2, P] the indices of all pairs of ``positions``, the first of which is in the ``chunk`` and comes before the other, that
+    are too near to each other."""
+    near = tree.query_ball_point(positions[chunk], radius[chunk], workers=-1)
+    a, b = np.repeat(chunk, [len(n) for n in near]), np.concatenate(near).astype(np.int32)
+    a, b = a[a < b], b[a < b]
+    too_near = np.linalg.norm(positions[a] - positions[b], axis=1) < radius[b]
+    return np.stack([a[too_near], b[too_near]])

@@ -88,6 +88,7 @@ def recovery(parser: Parser) -> Run:
     """How true a fit's light and materials are, against the path-traced scene that it was fitted to, also under other lights."""
     parser.add_argument("run_folder", type=Path, metavar="RUN", help="a run's folder")
     parser.add_argument("truth", help=f"the scene of its photographs: an XML file, or {known('targets')}")
+    add_variables(parser)
     add_names(parser, "--lights", "environments of the suite to relight it", default=[])
     add_integer(parser, "--size", 400, "pixels along a side of the path-traced views")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where to (default: recovery in the run's folder)")
@@ -98,7 +99,10 @@ def recovery(parser: Parser) -> Run:
         set_variant(args.variant)
         from ..commands.recovery import recovery
 
-        figures = recovery(args.run_folder, truth, args.lights, size=args.size, out=args.out, quiet=args.quiet)
+        variables, size = parse_variables(args.define), args.size
+        figures = recovery(
+            args.run_folder, truth, args.lights, variables=variables, size=size, out=args.out, quiet=args.quiet
+        )
         print(json.dumps(figures, indent=1))
 
     return run

@@ -1,6 +1,7 @@
 """What photographs agree on, and look through: a tray with a floor, and things that must stay; kernels against loops."""
 
 import functools
+import tracemalloc
 
 import mitsuba as mi
 import numpy as np
@@ -10,7 +11,7 @@ from scipy import ndimage
 from rgs_mi.core.camera import Camera
 from rgs_mi.core.color import srgb_decode
 from rgs_mi.datasets.types import Dataset, View
-from rgs_mi.priors import hull, stereo
+from rgs_mi.priors import hull, sampling, stereo
 from rgs_mi.priors.initialization import initial_points
 from rgs_mi.priors.openings import openings, seen_through
 from rgs_mi.priors.sampling import thinned
@@ -270,7 +271,9 @@ def test_openings_are_where_views_agree_on_what_is_more_alike_than_the_hull():
     assert opened([2.1] * 8, 0.2) == 0
 
 
-def test_thinned_points_keep_their_distance_and_leave_no_gap():
+@pytest.mark.parametrize("chunk", [300, 10_000])
+def test_thinned_points_keep_their_distance_and_leave_no_gap(monkeypatch, chunk):
+    monkeypatch.setattr(sampling, "_CHUNK", chunk)
     rng = np.random.default_rng(0)
     points, radius = rng.random((2000, 3)), rng.uniform(0.05, 0.15, 2000)
     kept = thinned(points, radius)
@@ -279,6 +282,17 @@ def test_thinned_points_keep_their_distance_and_leave_no_gap():
     own = np.arange(len(points))[:, None] == kept
     assert (distance < least)[kept][~own[kept]].sum() == 0
     assert (distance < least).any(1).all()
+
+
+def test_thinning_holds_few_neighbours_at_a_time(monkeypatch):
+    points, peak = np.random.default_rng(0).random((20_000, 3)), {}
+    for chunk in (1000, 20_000):
+        monkeypatch.setattr(sampling, "_CHUNK", chunk)
+        tracemalloc.start()
+        thinned(points, np.full(20_000, 0.08))
+        peak[chunk] = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak[1000] < 0.6 * peak[20_000]
 
 
 def test_smoothing_takes_noise_out_and_leaves_an_edge():
