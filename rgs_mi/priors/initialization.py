@@ -17,6 +17,7 @@ from .surface_points import oriented_points
 _FAR = 10
 _DEEPER = 2  # area of what lies below the hull, over that of the hull that is seen through
 _A_WRONG_MASK = 32  # in so many photographs one mask may be wrong at any point
+_COMPARED = 120  # photographs at most that are compared: more say little more, and half a second goes into each
 _FEW = 0.1  # of the points that are wanted: fewer that photographs agree on are no start
 
 
@@ -55,10 +56,12 @@ def initial_points(
         if on_hull:
             return _on_hull(views, count, rng, compare, len(views) // _A_WRONG_MASK if dataset.photographed else 0, quiet)
     elif compare:
-        maps = stereo.verified(stereo.depth_maps(views, quiet=quiet))
+        compared = _spread(views)
+        maps = stereo.verified(stereo.depth_maps(compared, quiet=quiet))
         positions, normals = oriented_points(maps, count, rng)
         if len(positions) > _FEW * count:
-            return Points(positions, normals, _spacing(positions), appearance(positions, views, _seen_in(maps, views)))
+            look = appearance(positions, compared, _seen_in(maps, compared))
+            return Points(positions, normals, _spacing(positions), look)
     if dataset.points is not None and len(dataset.points):
         chosen = np.sort(rng.permutation(len(dataset.points))[:count])
         positions = np.asarray(dataset.points, np.float32)[chosen]
@@ -80,8 +83,9 @@ def _on_hull(views, count, rng, compare, outvoted, quiet) -> Points:
     mesh = hull.surface(hull.visual_hull(views, outvoted=outvoted))
     positions, normals = sample_surface(*mesh, count, rng)
     if compare:
-        maps = stereo.verified(stereo.depth_maps(views, mesh[:2], quiet))
-        opened = openings(stereo.depth_maps(views, mesh[:2], quiet, COPIES))
+        compared = _spread(views)
+        maps = stereo.verified(stereo.depth_maps(compared, mesh[:2], quiet))
+        opened = openings(stereo.depth_maps(compared, mesh[:2], quiet, COPIES))
         gone, tree = seen_through(positions, opened, maps), spatial.KDTree(positions)
         below = oriented_points(
             opened + maps, _DEEPER * int(gone.sum()), rng, lambda above: gone[tree.query(above, workers=-1)[1]]
@@ -93,6 +97,11 @@ def _on_hull(views, count, rng, compare, outvoted, quiet) -> Points:
     reach = 2 * float(np.median(spacing))
     seen = lambda index, z, column, row: z < depths[index][row, column] + reach  # NaN: nothing is there
     return Points(positions, normals, spacing, appearance(positions, views, seen))
+
+
+def _spread(views):
+    """At most `_COMPARED` of ``views``, evenly from first to last: neighbours in a capture are alike."""
+    return [views[i] for i in np.linspace(0, len(views) - 1, min(len(views), _COMPARED)).round().astype(int)]
 
 
 def _unhidden(positions, views) -> Appearance:

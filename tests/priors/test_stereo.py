@@ -11,7 +11,7 @@ from scipy import ndimage
 from rgs_mi.core.camera import Camera
 from rgs_mi.core.color import srgb_decode
 from rgs_mi.datasets.types import Dataset, View
-from rgs_mi.priors import hull, sampling, stereo
+from rgs_mi.priors import hull, initialization, sampling, stereo
 from rgs_mi.priors.initialization import initial_points
 from rgs_mi.priors.openings import openings, seen_through
 from rgs_mi.priors.sampling import thinned
@@ -114,7 +114,10 @@ def starts(views):
     return [initial_points(Dataset(views, []), 4000, compare=compare)[:2] for compare in (False, True)]
 
 
-def test_a_tray_gets_its_inside():
+@pytest.mark.parametrize("compared", [40, 120])
+def test_a_tray_gets_its_inside(monkeypatch, compared):
+    """Also where not all of the photographs are compared."""
+    monkeypatch.setattr(initialization, "_COMPARED", compared)
     (lid, _), (points, normals) = starts(textured_tray())
     assert in_cavity(*lid.T).mean() > 0.1
     assert in_cavity(*points.T).mean() < 0.02
@@ -122,6 +125,19 @@ def test_a_tray_gets_its_inside():
     assert floor.mean() > 0.05 and np.median(normals[floor, 2]) > 0.95
     outside = lambda p: (p[:, 2] < FLOOR).sum()
     assert outside(points) > 0.97 * outside(lid)
+
+
+def test_no_more_photographs_are_compared_than_needed(monkeypatch):
+    """But those that are lie evenly among all."""
+    monkeypatch.setattr(initialization, "_COMPARED", 5)
+    asked = []
+    monkeypatch.setattr(stereo, "depth_maps", lambda views, *_, **__: asked.append(views) or [])
+    monkeypatch.setattr(stereo, "verified", lambda maps: maps)
+    monkeypatch.setattr(initialization, "oriented_points", lambda *_: (np.zeros((0, 3)), None))
+    views = unmasked(textured_tray())
+    initial_points(Dataset(views, []), 10)
+    (chosen,) = asked
+    assert [k for k, view in enumerate(views) if any(view is c for c in chosen)] == [0, 12, 24, 35, 47]
 
 
 def test_without_masks_points_lie_on_surfaces_too():
@@ -135,7 +151,9 @@ def test_without_masks_points_lie_on_surfaces_too():
     assert np.median(normals[on_floor(x, y, z), 2]) > 0.9
 
 
-def test_without_masks_walls_do_not_colour_what_they_hide():
+@pytest.mark.parametrize("compared", [40, 120])
+def test_without_masks_walls_do_not_colour_what_they_hide(monkeypatch, compared):
+    monkeypatch.setattr(initialization, "_COMPARED", compared)
     points, _, _, (colors, *_) = initial_points(Dataset(unmasked(textured_tray()), []), 4500)
     floor = on_floor(*points.T)
     alone = photographs({"floor": tray(0.25)["floor"]})[0]
