@@ -81,7 +81,8 @@ def growth(path: str | Path, data: str | Path, out: str | Path, loads: Sequence[
 def measured(path: str | Path, data: str | Path, load: Load) -> Cost:
     """Return what a fit of this ``load`` takes here and now (arguments: see `growth`)."""
     scene = FitScene.load(path, data)
-    settings = steady_settings(scene, load.surfels)
+    # The light stands still: where the same cameras come again and again, trials would have to tell
+    settings = replace(steady_settings(scene, load.surfels), light="world")
     dataset = enlarged(scene.dataset(settings.resolution), load.side, load.views)
     begin = time.perf_counter()
     fit = start(scene, dataset, settings)
