@@ -29,6 +29,7 @@ _STYLE: dict[Any, Any] = {
     "grid.color": _LINE,
     "lines.linewidth": 1.3,
 }
+_LONG = 100_000  # a number that does not fit below a mark
 _NO_METADATA = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 
 
@@ -104,6 +105,7 @@ def growth_figure(rows: "dict[str, dict[str, np.ndarray]]") -> "Figure":
     values, name of what that costs: [N]}}, a column of plots each, over which costs are doubly logarithmic."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
 
     costs = {"step_ms": "ms a step", "start_s": "s until the first step", "memory_mb": "MB of memory"}
     words = {"surfels": "surfels", "side": "pixels of a photograph's side", "views": "photographs"}
@@ -121,6 +123,9 @@ def growth_figure(rows: "dict[str, dict[str, np.ndarray]]") -> "Figure":
         for axes in grid.flat:
             _plain(axes)
             axes.minorticks_off()
+        for axes, (name, row) in zip(grid[-1], rows.items()):
+            if max(row[name]) >= _LONG:
+                axes.xaxis.set_major_formatter(EngFormatter())  # 300 k, 1 M
     return figure
 
 
