@@ -46,7 +46,7 @@ def thinned(positions: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Return the indices of a Poisson-disk subset of ``positions`` [N, 3], no two of which are nearer than the smaller of
     their ``radius`` [N]. It is made in rounds: a point stays when no remaining neighbour comes before it."""
     tree, indices = spatial.KDTree(positions), np.arange(len(positions), dtype=np.int32)
-    chunks = np.array_split(indices, -(-len(indices) // _CHUNK) or 1)
+    chunks = np.array_split(indices, -(-len(indices) // _CHUNK))
     a, b = np.concatenate([_close(tree, positions, radius, chunk) for chunk in chunks], 1)
     state = np.zeros(len(positions), np.int8)  # 0 open, 1 kept, -1 removed
     while (state == 0).any():
@@ -64,6 +64,6 @@ def _close(tree, positions, radius, chunk):
     are too near to each other."""
     near = tree.query_ball_point(positions[chunk], radius[chunk], workers=-1)
     a, b = np.repeat(chunk, [len(n) for n in near]), np.concatenate(near).astype(np.int32)
-    a, b = a[a < b], b[a < b]
-    too_near = np.linalg.norm(positions[a] - positions[b], axis=1) < radius[b]
-    return np.stack([a[too_near], b[too_near]])
+    pairs = np.stack([a, b])[:, a < b]  # the index is the order
+    a, b = pairs
+    return pairs[:, np.linalg.norm(positions[a] - positions[b], axis=1) < radius[b]]
