@@ -16,29 +16,35 @@ _SPLIT_SCALE = 1.6  # a split surfel's halves are that much smaller (3DGS)
 
 
 class Gradients:
-    """The running mean of the image-plane gradient of each surfel's center, over the views that saw it, for ``n``
-    surfels."""
+    """Running means over the views that saw a surfel, for ``n`` of them: of the image-plane gradient of its center, and of the
+    part of the picture that it makes."""
 
     def __init__(self, n: int) -> None:
-        self.sum, self.count = dr.zeros(mi.Float, n), dr.zeros(mi.Float, n)
+        self.sum, self.count, self.weight = (dr.zeros(mi.Float, n) for _ in range(3))
 
-    def add(self, gradient: "mi.Vector2f", seen: "mi.Bool", size: tuple[int, int]) -> None:
+    def add(self, gradient: "mi.Vector2f", seen: "mi.Bool", size: tuple[int, int], weight: "mi.Float | float" = 0) -> None:
         """Add a view of ``size`` (width, height) that listed the surfels ``seen``; ``gradient`` is that of the loss with
         respect to the projected centers in pixels, one entry per surfel. It is kept in NDC units, as 3DGS measures it; one
-        that overflowed counts as zero."""
+        that overflowed counts as zero. ``weight`` is the part of the picture that each makes, Σ w over the pixels."""
         length = dr.norm(mi.Vector2f(gradient.x * (size[0] / 2), gradient.y * (size[1] / 2)))
         self.sum += dr.select(seen & dr.isfinite(length), length, 0)
         self.count += dr.select(seen, mi.Float(1), 0)
-        dr.eval(self.sum, self.count)
+        self.weight += weight
+        dr.eval(self.sum, self.count, self.weight)
 
-    def merge(self, sum: "mi.Float", count: "mi.Float") -> None:
-        """Add another's ``sum`` and ``count``, of the same surfels."""
-        self.sum, self.count = self.sum + sum, self.count + count
-        dr.eval(self.sum, self.count)
+    def merge(self, sum: "mi.Float", count: "mi.Float", weight: "mi.Float") -> None:
+        """Add another's ``sum``, ``count`` and ``weight``, of the same surfels."""
+        self.sum, self.count, self.weight = self.sum + sum, self.count + count, self.weight + weight
+        dr.eval(self.sum, self.count, self.weight)
 
     def mean(self) -> np.ndarray:
         """Return the mean [N] of the gradients' lengths in NDC units, zero for surfels that no view saw."""
         return self.sum.numpy() / np.maximum(self.count.numpy(), 1)
+
+    def weights(self) -> np.ndarray:
+        """Return the mean [N] of the parts that surfels make of a picture, over the mean of these."""
+        weights = self.weight.numpy() / np.maximum(self.count.numpy(), 1)
+        return weights / max(weights.mean(), 1e-20)
 
 
 class DensityControl:
@@ -97,7 +103,8 @@ def densify(
 
     Surfels whose mean gradient exceeds the threshold are cloned when small and split when large, the largest gradients
     first while ``budget`` (surfels in all) lasts; for those that are ``guided`` ([N] bool or None) half the threshold is
-    enough (RGS, Algorithm 1). Transparent, unseen and huge ones go.
+    enough (RGS, Algorithm 1). Transparent, unseen and huge ones go, and those that others hide, or that make next to nothing
+    of any picture.
     """
     gradient, seen = gradients.mean(), gradients.count.numpy() > 0
     if guided is not None:
@@ -106,6 +113,7 @@ def densify(
     scales = np.exp(model.numpy("log_scales"))
     largest = scales.max(1)
     keep = seen & (opacity > settings.prune_opacity) & (largest < 0.3 * extent)
+    keep &= gradients.weights() >= settings.prune_weight
     if not keep.any():
         return
 

@@ -32,6 +32,7 @@ from .turns import Turns
 _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
 _HIDE = 4  # such trees from one time that it is asked what surfels hide of the light to the next
 _PACE = 31  # steps whose median says how long one takes
+_STATISTICS = "sum", "count", "weight"  # of `Gradients`
 _DIVERGED = 10  # steps in a row without a finite error
 
 
@@ -95,7 +96,7 @@ class Fit:
     def state(self) -> tuple[dict, dict]:
         """(arrays, meta) for a checkpoint: with `resume` the fit goes on as if it had not been interrupted."""
         gradients = self.density.gradients
-        arrays = {"gradient_sum": gradients.sum.numpy(), "gradient_count": gradients.count.numpy()}
+        arrays = {f"gradient_{name}": getattr(gradients, name).numpy() for name in _STATISTICS}
         meta = {"step": self.step_number, "views_used": self.views_used, "elapsed": self.elapsed, "extent": self.extent}
         meta["level"] = self._level and self._level.meta()
         for learned in (self.cameras, self.turns, self._light):
@@ -108,7 +109,8 @@ class Fit:
         fit = cls(dataset, Model.from_state(arrays), settings, float(meta["extent"]), **others)
         fit.step_number, fit.views_used, fit.elapsed = int(meta["step"]), int(meta["views_used"]), float(meta["elapsed"])
         gradients = fit.density.gradients
-        gradients.sum, gradients.count = (as_float(arrays[f"gradient_{k}"]) for k in ("sum", "count"))
+        for name in _STATISTICS:
+            setattr(gradients, name, as_float(arrays[f"gradient_{name}"]))
         for learned in (fit.cameras, fit.turns, fit._light):
             if learned:
                 learned.restore(arrays)
@@ -310,10 +312,10 @@ class Fit:
         if lighting:  # whose maps come first of what it learns
             del shared[len(CHANNELS)]
             light = self._light.gather(self.step_number, gradients.pop(len(CHANNELS)))
-        *gradients, lengths, counts, error, light = self.ranks.mean(
-            [*gradients, statistics.sum, statistics.count, error, light]
+        *gradients, lengths, counts, weights, error, light = self.ranks.mean(
+            [*gradients, *(getattr(statistics, name) for name in _STATISTICS), error, light]
         )
-        self.density.gradients.merge(lengths * self.ranks.size, counts * self.ranks.size)
+        self.density.gradients.merge(*(mean * self.ranks.size for mean in (lengths, counts, weights)))
         measured.append({"error": error})
         if light is not None:
             self._light.pass_on(self.model, light)
@@ -336,13 +338,16 @@ class Fit:
             lighting = replace(lighting, turn=self.turns.see(photo.camera))
         means2d_offset = dr.zeros(mi.Vector2f, len(self.model))
         dr.enable_grad(means2d_offset)
-        image = deferred.render(surfels, photo.camera, lighting, means2d_offset, CUTOFFS, self.objective.full)
+        contribution = dr.zeros(mi.Float, len(self.model)) if self.settings.density.prune_weight > 0 else None
+        dr.enable_grad(contribution)
+        image = deferred.render(surfels, photo.camera, lighting, means2d_offset, CUTOFFS, self.objective.full, contribution)
         consistency = self.schedule.value(self.settings.weights.consistency, self.progress)
         loss = self.objective(image, photo, self.dataset.train[i].masked, consistency, self.step_number, gain)
         terms |= loss.terms
-        dr.backward(sum(terms.values()) * weight)
+        total = sum(terms.values()) * weight
+        dr.backward(total if contribution is None else total + dr.mean(image.gbuffer.all.contribution))
         gradient = dr.grad(means2d_offset) * (photo.part / weight)  # as if all of the window had been seen
-        statistics.add(gradient, image.gbuffer.seen, photo.size)
+        statistics.add(gradient, image.gbuffer.seen, photo.size, 0 if contribution is None else dr.grad(contribution))
         if loss.reflective is not None:
             self.density.note_reflective(i, photo.camera, loss.reflective)
         return dr.detach(terms) | {"error": loss.error}

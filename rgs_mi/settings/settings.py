@@ -190,6 +190,13 @@ class Density:
         default=0.01, ge=0, le=1, description="Surfels smaller than this, in units of the object, are cloned, others split."
     )
     prune_opacity: float = Field(default=0.05, ge=0, le=1, description="Surfels of less opacity are removed.")
+    prune_weight: float = Field(
+        default=0,
+        ge=0,
+        le=1,
+        description="Surfels that make less of a picture, in the mean over the views that list them, than this part of what "
+        "they make in the mean are removed.",
+    )
     max_surfels: int | None = Field(
         default=None,
         ge=1,

@@ -90,9 +90,10 @@ def render(
     means2d_offset: "mi.Vector2f | None" = None,
     cutoffs: Cutoffs = Cutoffs(),
     full: bool = False,
+    contribution: "mi.Float | None" = None,
 ) -> Image:
     """Splat ``surfels`` (see `render_gbuffer`, also for the other arguments) and `shade` them; differentiable in their
     fields, the environment and the shader."""
     if lighting is not None:
         surfels = lighting.as_splatted(surfels)
-    return shade(render_gbuffer(surfels, camera, means2d_offset, cutoffs, full), camera, lighting)
+    return shade(render_gbuffer(surfels, camera, means2d_offset, cutoffs, full, contribution), camera, lighting)

@@ -29,6 +29,7 @@ class Maps:
     alpha          Σ w, coverage in [0, 1]
     delta_normal   Σ w Δn, world space
     square         Σ w z²; this and delta_normal where `render_gbuffer` was asked for all maps, else None
+    contribution   Σ w times `render_gbuffer`'s argument of that name, None without it
     """
 
     diffuse: "mi.Color3f"
@@ -40,17 +41,20 @@ class Maps:
     alpha: "mi.Float"
     delta_normal: "mi.Vector3f | None" = None
     square: "mi.Float | None" = None
+    contribution: "mi.Float | None" = None
 
 
 @dataclass
 class GBuffer:
     """All maps of a view of ``size`` (width, height) pixels, interleaved in ``image`` as `composite` writes them (row-major);
-    ``seen`` says of each surfel whether any tile of this view lists it, ``full`` whether all maps are there."""
+    ``seen`` says of each surfel whether any tile of this view lists it, ``full`` whether all maps are there, and ``weighed``
+    whether that of contributions is."""
 
     size: tuple[int, int]
     image: "mi.Float"
     seen: "mi.Bool"
     full: bool = False
+    weighed: bool = False
 
     @functools.cached_property
     def all(self) -> Maps:
@@ -69,6 +73,7 @@ class GBuffer:
     def _maps(self, m):
         """The maps that pixels' floats ``m`` are."""
         delta, m[11:] = (mi.Vector3f(*m[11:14]), m[14:]) if self.full else (None, m[11:])
+        contribution = m.pop(11) if self.weighed else None
         return Maps(
             mi.Color3f(*m[0:3]),
             mi.Vector3f(*m[3:6]),
@@ -79,6 +84,7 @@ class GBuffer:
             m[12],
             delta,
             m[13] if self.full else None,
+            contribution,
         )
 
 
@@ -114,9 +120,11 @@ def render_gbuffer(
     means2d_offset: "mi.Vector2f | None" = None,
     cutoffs: Cutoffs = Cutoffs(),
     full: bool = False,
+    contribution: "mi.Float | None" = None,
 ) -> GBuffer:
     """Splat ``surfels`` into ``camera``; differentiable in all fields. ``means2d_offset`` is that of `project`; ``full`` asks
-    for the maps that only regularizers want, too."""
+    for the maps that only regularizers want, too. Where there is a ``contribution``, a zero for each surfel, the gradient in it
+    of the sum of the map of this name is Σ w, how much each weighs in all pixels together."""
     surfels = surfels.split()
     projected = project(surfels, camera, means2d_offset)
     delta = surfels.column(mi.Vector3f, "delta_normal")
@@ -127,8 +135,9 @@ def render_gbuffer(
         surfels.column(mi.Float, "roughness"),
         surfels.column(mi.Float, "metallic"),
         *(delta if full else ()),
+        *(() if contribution is None else (contribution,)),
     ]
     dr.eval(projected.geometry, features, projected.normal_derivatives)
     isects = isect_tiles(projected, camera.size, cutoffs)
     image = composite(projected, features, isects, Layout(camera.size, len(features), cutoffs, squares=full))
-    return GBuffer(camera.size, image, isects.seen, full)
+    return GBuffer(camera.size, image, isects.seen, full, contribution is not None)

@@ -113,6 +113,19 @@ def test_transparent_unseen_and_huge_surfels_go():
     assert np.allclose(m.numpy("centers"), centers[3:])
 
 
+def test_surfels_that_hardly_show_go_where_that_is_asked():
+    """Judged by what they make of the pictures that list them: one that few list stays."""
+    m, weight, count = model(), np.ones(N, np.float32), np.full(N, 4, np.float32)
+    weight[0], weight[1], count[1] = 0.01, 0.25, 1
+    centers = m.numpy("centers")
+    found = gradients(np.zeros(N), count)
+    found.weight = mi.Float(weight)
+    densify(m, found, 1.0, Density(), np.random.default_rng(0), 1000)
+    assert len(m) == N
+    densify(m, found, 1.0, Density(prune_weight=0.05), np.random.default_rng(0), 1000)
+    assert np.allclose(m.numpy("centers"), centers[1:])
+
+
 def test_budget_goes_to_the_largest_gradients():
     m = model()
     centers = m.numpy("centers")

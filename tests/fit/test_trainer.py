@@ -13,7 +13,7 @@ from rgs_mi.commands.optimize import start
 from rgs_mi.core.arrays import as_float
 from rgs_mi.datasets.photographs import Photographs
 from rgs_mi.datasets.types import DepthPrior
-from rgs_mi.fit import losses, schedule
+from rgs_mi.fit import losses, objective, schedule
 from rgs_mi.fit.density import Gradients
 from rgs_mi.fit.light_maps import STEPS, LightMaps
 from rgs_mi.fit.trainer import Fit
@@ -98,6 +98,22 @@ def test_masks_that_may_be_wrong_show_what_lies_behind(dataset):
     assert (image(photo.behind)[~near] == 1).all() and (photo.alpha.numpy() == exact.alpha.numpy()).all()
     whole = replace(view, masked=False)
     assert (Photographs([whole], 1, 0.5, tolerance=3).tile(0).behind.x.numpy() == 0.5).all()
+
+
+def test_steps_note_what_surfels_make_of_pictures(dataset):
+    """All of them together what is covered; the losses and their gradients know nothing of it."""
+    weighing = replace(SETTINGS, density=replace(SETTINGS.density, prune_weight=0.05))
+    found = []
+    for settings in (SETTINGS, weighing):
+        fit, statistics = Fit(dataset, model(), settings, 1.0), Gradients(len(model()))
+        fit.photographs = Photographs(dataset.train, 1, 1.0)
+        loss = fit._view(3, fit.model.surfels(0), None, 1.0, statistics)
+        found.append((float(loss["loss.photometric"][0]), statistics.sum.numpy(), statistics.weight.numpy()))
+    camera = fit.photographs.tile(3).camera
+    covered = deferred.render(fit.model.surfels(0), camera, None, cutoffs=objective.CUTOFFS).gbuffer.all.alpha
+    assert found[0][0] == found[1][0]
+    np.testing.assert_allclose(found[0][1], found[1][1], rtol=1e-4, atol=1e-9)
+    assert not found[0][2].any() and found[1][2].sum() == pytest.approx(covered.numpy().mean(), rel=1e-4)
 
 
 def test_tiles_of_a_large_window_estimate_it(dataset, monkeypatch):

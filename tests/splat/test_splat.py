@@ -84,6 +84,24 @@ def test_backward_equals_reference():
         assert np.abs(mine[name] - reference[name]).max() < 1e-3 * scale, name
 
 
+@pytest.mark.parametrize("full", [False, True])
+def test_contributions_are_what_surfels_weigh(full):
+    """The sum of their weights in all pixels, as the gradient of the twin's metallic has it; and no other map changes."""
+    surfels, camera = sphere_surfels(60, seed=5), orbit_camera(size=(32, 24))
+    contribution = dr.zeros(mi.Float, len(surfels))
+    dr.enable_grad(contribution, surfels.metallic)
+    found = gbuffer.render_gbuffer(surfels, camera, cutoffs=SMOOTH, full=full, contribution=contribution).all
+    plain = gbuffer.render_gbuffer(surfels, camera, cutoffs=SMOOTH, full=full).all
+    for name in MAPS if full else ("diffuse", "normal", "base_color", "roughness", "metallic", "depth", "alpha"):
+        assert np.array_equal(getattr(found, name).numpy(), getattr(plain, name).numpy()), name
+    dr.backward(dr.sum(found.contribution))
+    assert not dr.grad(surfels.metallic).numpy().any()
+    dr.backward(dr.sum(render_gbuffer_reference(surfels, camera, cutoffs=SMOOTH).metallic))
+    expected = dr.grad(surfels.metallic).numpy().ravel()
+    assert expected.max() > 1
+    np.testing.assert_allclose(dr.grad(contribution).numpy(), expected, atol=1e-3 * expected.max())
+
+
 def test_window_brings_tiles_into_order():
     """A surface whose surfels are as far apart as its pixels: what is left of the tiles' grid is faint."""
     surfels, camera = replace(sphere_surfels(20_000), two_sided=False), orbit_camera(size=(96, 96))
