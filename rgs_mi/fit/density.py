@@ -1,5 +1,7 @@
 """Adaptive density control: clone, split, prune (3DGS § 5, 2DGS). The optimizer's moments follow the surfels."""
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -55,7 +57,9 @@ class DensityControl:
     """
 
     def __init__(self, settings: Density, extent: float, box: BoundingBox | None, n: int) -> None:
-        self.settings, self.extent, self.box = settings, extent, box
+        # What lies around the object is large, and all else little beside it
+        self.settings = settings if box is None else replace(settings, prune_weight=0)
+        self.extent, self.box = extent, box
         self.gradients = Gradients(n)
         self.reflective: dict[int, tuple[Camera, np.ndarray]] = {}  # by view: its camera, and boxes of what is reflective
 

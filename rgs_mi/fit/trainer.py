@@ -338,7 +338,7 @@ class Fit:
             lighting = replace(lighting, turn=self.turns.see(photo.camera))
         means2d_offset = dr.zeros(mi.Vector2f, len(self.model))
         dr.enable_grad(means2d_offset)
-        contribution = dr.zeros(mi.Float, len(self.model)) if self.settings.density.prune_weight > 0 else None
+        contribution = dr.zeros(mi.Float, len(self.model)) if self.density.settings.prune_weight > 0 else None
         dr.enable_grad(contribution)
         image = deferred.render(surfels, photo.camera, lighting, means2d_offset, CUTOFFS, self.objective.full, contribution)
         consistency = self.schedule.value(self.settings.weights.consistency, self.progress)

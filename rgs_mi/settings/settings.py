@@ -194,8 +194,8 @@ class Density:
         default=0,
         ge=0,
         le=1,
-        description="Surfels that make less of a picture, in the mean over the views that list them, than this part of what "
-        "they make in the mean are removed.",
+        description="Surfels of an object without surroundings that make less of a picture, in the mean over the views that "
+        "list them, than this part of what they make in the mean are removed.",
     )
     max_surfels: int | None = Field(
         default=None,
