@@ -1,11 +1,13 @@
 """Adaptive density control: clone, split, prune (3DGS § 5, 2DGS). The optimizer's moments follow the surfels."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.arrays import as_float
 from ..core.bounding_box import BoundingBox
 from ..core.camera import Camera
 from ..settings.settings import Density
@@ -47,6 +49,15 @@ class Gradients:
         """Return the mean [N] of the parts that surfels make of a picture, over the mean of these."""
         weights = self.weight.numpy() / np.maximum(self.count.numpy(), 1)
         return weights / max(weights.mean(), 1e-20)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return everything that a checkpoint needs, as NumPy arrays."""
+        return {f"gradient_{name}": value.numpy() for name, value in vars(self).items()}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Take the `state` that a checkpoint has."""
+        for name in vars(self):
+            setattr(self, name, as_float(arrays[f"gradient_{name}"]))
 
 
 class DensityControl:

@@ -8,7 +8,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..core.arrays import as_float
 from ..core.runtime import release_memory
 from ..datasets.photographs import Photographs, tiling
 from ..datasets.types import Dataset, DepthPrior
@@ -32,7 +31,6 @@ from .turns import Turns
 _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table to sample the light by, to the next
 _HIDE = 4  # such trees from one time that it is asked what surfels hide of the light to the next
 _PACE = 31  # steps whose median says how long one takes
-_STATISTICS = "sum", "count", "weight"  # of `Gradients`
 _DIVERGED = 10  # steps in a row without a finite error
 
 
@@ -95,8 +93,7 @@ class Fit:
 
     def state(self) -> tuple[dict, dict]:
         """(arrays, meta) for a checkpoint: with `resume` the fit goes on as if it had not been interrupted."""
-        gradients = self.density.gradients
-        arrays = {f"gradient_{name}": getattr(gradients, name).numpy() for name in _STATISTICS}
+        arrays = self.density.gradients.state()
         meta = {"step": self.step_number, "views_used": self.views_used, "elapsed": self.elapsed, "extent": self.extent}
         meta["level"] = self._level and self._level.meta()
         for learned in (self.cameras, self.turns, self._light):
@@ -108,9 +105,7 @@ class Fit:
         """The fit whose `state` this was. ``others``: ``shading``, ``priors``, ``ranks``."""
         fit = cls(dataset, Model.from_state(arrays), settings, float(meta["extent"]), **others)
         fit.step_number, fit.views_used, fit.elapsed = int(meta["step"]), int(meta["views_used"]), float(meta["elapsed"])
-        gradients = fit.density.gradients
-        for name in _STATISTICS:
-            setattr(gradients, name, as_float(arrays[f"gradient_{name}"]))
+        fit.density.gradients.restore(arrays)
         for learned in (fit.cameras, fit.turns, fit._light):
             if learned:
                 learned.restore(arrays)
@@ -313,7 +308,7 @@ class Fit:
             del shared[len(CHANNELS)]
             light = self._light.gather(self.step_number, gradients.pop(len(CHANNELS)))
         *gradients, lengths, counts, weights, error, light = self.ranks.mean(
-            [*gradients, *(getattr(statistics, name) for name in _STATISTICS), error, light]
+            [*gradients, statistics.sum, statistics.count, statistics.weight, error, light]
         )
         self.density.gradients.merge(*(mean * self.ranks.size for mean in (lengths, counts, weights)))
         measured.append({"error": error})
