@@ -19,7 +19,7 @@ import numpy as np
 from ..datasets.photographs import Photographs
 from ..fit import losses
 from ..fit.cameras import Cameras
-from ..fit.density import DensityControl, Gradients
+from ..fit.density import DensityControl, Statistics
 from ..fit.objective import Objective
 from ..shading import deferred, prefilter
 from ..shading.indirect import Indirect
@@ -44,7 +44,7 @@ STAGES = {
     ),
     "shading, back": ((gbuffer._Planes, "backward"), (composite, "_gather_image")),
     "backward": ((composite.Composite, "backward"),),
-    "projection, back": ((Gradients, "add"), (surfels._Split, "backward")),
+    "projection, back": ((Statistics, "add"), (surfels._Split, "backward")),
     "density control": ((DensityControl, "note_reflective"), (DensityControl, "refine")),
     "optimizer": ((drjit.opt.Optimizer, "step"),),
     "cameras": ((Cameras, "see"), (Cameras, "step")),

@@ -1,6 +1,6 @@
 """Adaptive density control: clone, split, prune (3DGS § 5, 2DGS). The optimizer's moments follow the surfels."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import drjit as dr
@@ -19,45 +19,47 @@ from .reflection_guided import boxes, guided
 _SPLIT_SCALE = 1.6  # a split surfel's halves are that much smaller (3DGS)
 
 
-class Gradients:
-    """Running means over the views that saw a surfel, for ``n`` of them: of the image-plane gradient of its center, and of the
-    part of the picture that it makes."""
+class Statistics:
+    """Sums over the views that list a surfel, for ``n`` surfels.
+
+    count     1: how many these are
+    gradient  length of the gradient of the loss on the image plane, with respect to the projected center, NDC units (3DGS)
+    weight    Σ w over the pixels, the part of a picture that it makes
+    share     Σ w l over the pixels, its part of the photometric loss, whose value at a pixel is l
+    """
 
     def __init__(self, n: int) -> None:
-        self.sum, self.count, self.weight = (dr.zeros(mi.Float, n) for _ in range(3))
+        self.count, self.gradient, self.weight, self.share = (dr.zeros(mi.Float, n) for _ in range(4))
 
-    def add(self, gradient: "mi.Vector2f", seen: "mi.Bool", size: tuple[int, int], weight: "mi.Float | float" = 0) -> None:
+    def add(self, gradient: "mi.Vector2f", contribution: "mi.Vector2f", seen: "mi.Bool", size: tuple[int, int]) -> None:
         """Add a view of ``size`` (width, height) that listed the surfels ``seen``; ``gradient`` is that of the loss with
-        respect to the projected centers in pixels, one entry per surfel. It is kept in NDC units, as 3DGS measures it; one
-        that overflowed counts as zero. ``weight`` is the part of the picture that each makes, Σ w over the pixels."""
+        respect to the projected centers in pixels, one entry per surfel, and ``contribution`` are weight and share. What
+        overflowed counts as zero."""
         length = dr.norm(mi.Vector2f(gradient.x * (size[0] / 2), gradient.y * (size[1] / 2)))
-        self.sum += dr.select(seen & dr.isfinite(length), length, 0)
-        self.count += dr.select(seen, mi.Float(1), 0)
-        self.weight += weight
-        dr.eval(self.sum, self.count, self.weight)
+        self.merge([dr.select(seen & dr.isfinite(value), value, 0) for value in (mi.Float(1), length, *contribution)])
 
-    def merge(self, sum: "mi.Float", count: "mi.Float", weight: "mi.Float") -> None:
-        """Add another's ``sum``, ``count`` and ``weight``, of the same surfels."""
-        self.sum, self.count, self.weight = self.sum + sum, self.count + count, self.weight + weight
-        dr.eval(self.sum, self.count, self.weight)
+    def sums(self) -> "list[mi.Float]":
+        """Return all of them."""
+        return list(vars(self).values())
 
-    def mean(self) -> np.ndarray:
-        """Return the mean [N] of the gradients' lengths in NDC units, zero for surfels that no view saw."""
-        return self.sum.numpy() / np.maximum(self.count.numpy(), 1)
+    def merge(self, sums: "Sequence[mi.Float]") -> None:
+        """Add another's `sums`, of the same surfels."""
+        for name, value in zip(vars(self), sums):
+            setattr(self, name, getattr(self, name) + value)
+        dr.eval(self.sums())
 
-    def weights(self) -> np.ndarray:
-        """Return the mean [N] of the parts that surfels make of a picture, over the mean of these."""
-        weights = self.weight.numpy() / np.maximum(self.count.numpy(), 1)
-        return weights / max(weights.mean(), 1e-20)
+    def mean(self, name: str) -> np.ndarray:
+        """Return the mean [N] of one of them over the views that list a surfel, zero where none does."""
+        return getattr(self, name).numpy() / np.maximum(self.count.numpy(), 1)
 
     def state(self) -> dict[str, np.ndarray]:
         """Return everything that a checkpoint needs, as NumPy arrays."""
-        return {f"gradient_{name}": value.numpy() for name, value in vars(self).items()}
+        return {f"statistics_{name}": value.numpy() for name, value in vars(self).items()}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Take the `state` that a checkpoint has."""
         for name in vars(self):
-            setattr(self, name, as_float(arrays[f"gradient_{name}"]))
+            setattr(self, name, as_float(arrays[f"statistics_{name}"]))
 
 
 class DensityControl:
@@ -68,10 +70,10 @@ class DensityControl:
     """
 
     def __init__(self, settings: Density, extent: float, box: BoundingBox | None, n: int) -> None:
-        # What lies around the object is large, and all else little beside it
-        self.settings = settings if box is None else replace(settings, prune_weight=0)
+        # What lies around the object is large, and all else little beside it; and what shows through its holes is nobody's share
+        self.settings = settings if box is None else replace(settings, prune_weight=0, grow_by="gradient")
         self.extent, self.box = extent, box
-        self.gradients = Gradients(n)
+        self.statistics = Statistics(n)
         self.reflective: dict[int, tuple[Camera, np.ndarray]] = {}  # by view: its camera, and boxes of what is reflective
 
     def note_reflective(self, view: int, camera: Camera, mask: np.ndarray) -> None:
@@ -94,8 +96,8 @@ class DensityControl:
     def refine(self, model: Model, rng: np.random.Generator, budget: int | None) -> None:
         """End a round of statistics: `densify`, unless ``budget`` is None, and begin the next."""
         if budget is not None:
-            densify(model, self.gradients, self._extents(model), self.settings, rng, budget, self.guided(model))
-        self.gradients = Gradients(len(model))
+            densify(model, self.statistics, self._extents(model), self.settings, rng, budget, self.guided(model))
+        self.statistics = Statistics(len(model))
 
     def _extents(self, model):
         """What is large for a surfel: the object, or the distance from it in the surroundings."""
@@ -106,7 +108,7 @@ class DensityControl:
 
 def densify(
     model: Model,
-    gradients: Gradients,
+    statistics: Statistics,
     extent: float | np.ndarray,
     settings: Density,
     rng: np.random.Generator,
@@ -116,26 +118,33 @@ def densify(
     """Do one round of density control, in place. ``extent`` is the radius of the object in world units, or [N] what is large
     for each surfel.
 
-    Surfels whose mean gradient exceeds the threshold are cloned when small and split when large, the largest gradients
-    first while ``budget`` (surfels in all) lasts; for those that are ``guided`` ([N] bool or None) half the threshold is
-    enough (RGS, Algorithm 1). Transparent, unseen and huge ones go, and those that others hide, or that make next to nothing
-    of any picture.
+    Surfels grow, the neediest first while ``budget`` (surfels in all) lasts, by what `Density.grow_by` says:
+
+    gradient  where their mean gradient exceeds the threshold they are cloned when small and split when large (3DGS)
+    loss      where they have more of the photometric loss than surfels in the mean (after Rota Bulò et al. 2024) they are split
+
+    For those that are ``guided`` ([N] bool or None) half of that is enough (RGS, Algorithm 1). Transparent, unseen and huge ones
+    go, and those that others hide, or that make next to nothing of any picture.
     """
-    gradient, seen = gradients.mean(), gradients.count.numpy() > 0
-    if guided is not None:
-        gradient = gradient * np.where(guided, 2, 1)
     opacity = 1 / (1 + np.exp(-model.numpy("logit_opacities")[:, 0]))
     scales = np.exp(model.numpy("log_scales"))
     largest = scales.max(1)
-    keep = seen & (opacity > settings.prune_opacity) & (largest < 0.3 * extent)
-    keep &= gradients.weights() >= settings.prune_weight
+    weight, listed = statistics.mean("weight"), statistics.count.numpy() > 0
+    keep = listed & (opacity > settings.prune_opacity) & (largest < 0.3 * extent)
+    keep &= weight >= settings.prune_weight * weight.mean()
     if not keep.any():
         return
 
-    hot = np.flatnonzero(keep & (gradient > settings.grow_grad2d))
+    if settings.grow_by == "loss":
+        share = statistics.mean("share")
+        need, large = share / max(share[keep].mean(), 1e-20), np.full(len(model), True)
+    else:
+        need, large = statistics.mean("gradient") / settings.grow_grad2d, largest > settings.grow_scale3d * extent
+    if guided is not None:
+        need = need * np.where(guided, 2, 1)
+    hot = np.flatnonzero(keep & (need > 1))
     room = max(0, budget - int(keep.sum()))
-    hot = np.sort(hot[np.argsort(-gradient[hot], kind="stable")][:room])
-    large = largest > settings.grow_scale3d * extent
+    hot = np.sort(hot[np.argsort(-need[hot], kind="stable")][:room])
     split, clone = hot[large[hot]], hot[~large[hot]]
 
     stay = np.flatnonzero(keep)

@@ -119,25 +119,25 @@ def _blurred_columns(planes, count, size, stride):
 
 
 def ssim(image: "mi.Color3f", target: "mi.Color3f", size: tuple[int, int]) -> "mi.Float":
-    """Return the mean structural similarity of two images of ``size`` (width, height), with an 11 × 11 Gaussian window of σ
-    1.5 (Wang et al. 2004); differentiable in the first."""
+    """Return the structural similarity of two images of ``size`` (width, height) at each pixel, the mean of its channels, with
+    an 11 × 11 Gaussian window of σ 1.5 (Wang et al. 2004); differentiable in the first."""
     with dr.suspend_grad():
         mu_y = mi.Color3f(*dr.custom(_Blur, list(target), size))
     blurred = dr.custom(_Blur, [*image, *(image * image + target * target), *(image * target)], size)
     mu_x, squares, xy = (mi.Color3f(*blurred[3 * k : 3 * k + 3]) for k in range(3))
     means, product = mu_x * mu_x + mu_y * mu_y, mu_x * mu_y  # of variances only the sum is asked for
     value = ((2 * product + _C1) * (2 * (xy - product) + _C2)) / ((means + _C1) * (squares - means + _C2))
-    return dr.mean(dr.mean(value))
+    return dr.mean(value)
 
 
 def photometric(image: "mi.Color3f", target: "mi.Color3f", size: tuple[int, int], dssim: float) -> "mi.Float":
-    """Return (1 − λ) L1 + λ (1 − SSIM)/2 with λ = ``dssim`` (3DGS), of display values.
+    """Return (1 − λ) L1 + λ (1 − SSIM)/2 with λ = ``dssim`` (3DGS) at each pixel, of display values.
 
     Where the photograph is saturated a brighter rendering is no error, and a too bright rendering elsewhere still feels its
     gradient.
     """
     image = dr.select(target >= SATURATED, dr.minimum(image, target), image)
-    l1 = dr.mean(dr.mean(dr.abs(image - target)))
+    l1 = dr.mean(dr.abs(image - target))
     return (1 - dssim) * l1 + dssim * (1 - ssim(image, target, size)) / 2
 
 

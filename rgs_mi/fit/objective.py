@@ -23,11 +23,12 @@ CUTOFFS = Cutoffs(transmittance_min=1e-2)  # of a step: what the last hundredth 
 
 @dataclass
 class ViewLoss:
-    """The losses of a view: weighted ``terms`` by the names that curves have for them, of width 1 each; the mean squared
-    ``error`` in display values, of width 1; and ``reflective`` [H, W] bool, β̂ of the view, None where nothing asks for
-    it."""
+    """The losses of a view: weighted ``terms`` by the names that curves have for them, of width 1 each; what the ``photometric``
+    one is the mean of, pixel by pixel, not differentiated; the mean squared ``error`` in display values, of width 1; and
+    ``reflective`` [H, W] bool, β̂ of the view, None where nothing asks for it."""
 
     terms: "dict[str, mi.Float]"
+    photometric: "mi.Float"
     error: "mi.Float"
     reflective: np.ndarray | None
 
@@ -65,7 +66,8 @@ class Objective:
         color, alpha = losses.completed(image.color, maps.alpha, CUTOFFS.transmittance_min)
         color = losses.evaluated_adjoint(color if gain is None else color * gain)
         rendered = losses.display(color, alpha, photo.behind)
-        terms = {"photometric": losses.photometric(rendered, photo.color, size, w.dssim)}
+        photometric = losses.photometric(rendered, photo.color, size, w.dssim)
+        terms = {"photometric": dr.mean(photometric)}
         if w.mask > 0 and masked:
             terms["mask"] = w.mask * losses.mask(alpha, photo.alpha)
         if w.delta_normal > 0:
@@ -79,7 +81,8 @@ class Objective:
         terms = {name: part_of_image * term for name, term in terms.items()}
         error = dr.mean(dr.mean(dr.square(dr.detach(rendered) - photo.color))) * part_of_image
         regional, reflective = self._regional(image.gbuffer, photo, step)
-        return ViewLoss({f"loss.{name}": term for name, term in (terms | regional).items()}, error, reflective)
+        terms = {f"loss.{name}": term for name, term in (terms | regional).items()}
+        return ViewLoss(terms, dr.detach(photometric), error, reflective)
 
     def _regional(self, gbuffer, photo, step):
         """Losses that are normalized by regions of their own: RGS's L_normal and L_depth, and minimum variation; and β̂."""

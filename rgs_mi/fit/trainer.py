@@ -20,7 +20,7 @@ from ..surfels.surfels import CHANNELS, Surfels
 from . import light_maps, losses, reflection_guided
 from .cameras import Cameras, mean_rows
 from .curves import Curves
-from .density import DensityControl, Gradients
+from .density import DensityControl, Statistics
 from .model import ENVIRONMENT, Model
 from .objective import CUTOFFS, Objective
 from .plan import COST, LAST, LEAST_STEPS, OFTEN, STEPS
@@ -93,7 +93,7 @@ class Fit:
 
     def state(self) -> tuple[dict, dict]:
         """(arrays, meta) for a checkpoint: with `resume` the fit goes on as if it had not been interrupted."""
-        arrays = self.density.gradients.state()
+        arrays = self.density.statistics.state()
         meta = {"step": self.step_number, "views_used": self.views_used, "elapsed": self.elapsed, "extent": self.extent}
         meta["level"] = self._level and self._level.meta()
         for learned in (self.cameras, self.turns, self._light):
@@ -105,7 +105,7 @@ class Fit:
         """The fit whose `state` this was. ``others``: ``shading``, ``priors``, ``ranks``."""
         fit = cls(dataset, Model.from_state(arrays), settings, float(meta["extent"]), **others)
         fit.step_number, fit.views_used, fit.elapsed = int(meta["step"]), int(meta["views_used"]), float(meta["elapsed"])
-        fit.density.gradients.restore(arrays)
+        fit.density.statistics.restore(arrays)
         for learned in (fit.cameras, fit.turns, fit._light):
             if learned:
                 learned.restore(arrays)
@@ -294,7 +294,7 @@ class Fit:
         dr.enable_grad(leaves)
         surfels = Surfels(**dict(zip(CHANNELS, leaves)), two_sided=surfels.two_sided)
         lighting = lighting and lighting.with_learned(leaves[len(CHANNELS) :], surfels)
-        statistics = Gradients(len(self.model))
+        statistics = Statistics(len(self.model))
         measured = [self._view(i, surfels, lighting, 1 / len(views), statistics) for i in views]
         error = dr.mean([m.pop("error") for m in measured])
         if lighting and self.schedule.explains(self.progress):
@@ -307,10 +307,10 @@ class Fit:
         if lighting:  # whose maps come first of what it learns
             del shared[len(CHANNELS)]
             light = self._light.gather(self.step_number, gradients.pop(len(CHANNELS)))
-        *gradients, lengths, counts, weights, error, light = self.ranks.mean(
-            [*gradients, statistics.sum, statistics.count, statistics.weight, error, light]
-        )
-        self.density.gradients.merge(*(mean * self.ranks.size for mean in (lengths, counts, weights)))
+        sums = statistics.sums()
+        *means, error, light = self.ranks.mean([*gradients, *sums, error, light])
+        gradients, sums = means[: -len(sums)], means[-len(sums) :]
+        self.density.statistics.merge([mean * self.ranks.size for mean in sums])
         measured.append({"error": error})
         if light is not None:
             self._light.pass_on(self.model, light)
@@ -333,16 +333,17 @@ class Fit:
             lighting = replace(lighting, turn=self.turns.see(photo.camera))
         means2d_offset = dr.zeros(mi.Vector2f, len(self.model))
         dr.enable_grad(means2d_offset)
-        contribution = dr.zeros(mi.Float, len(self.model)) if self.density.settings.prune_weight > 0 else None
+        contribution = dr.zeros(mi.Vector2f, len(self.model))
         dr.enable_grad(contribution)
         image = deferred.render(surfels, photo.camera, lighting, means2d_offset, CUTOFFS, self.objective.full, contribution)
         consistency = self.schedule.value(self.settings.weights.consistency, self.progress)
         loss = self.objective(image, photo, self.dataset.train[i].masked, consistency, self.step_number, gain)
         terms |= loss.terms
         total = sum(terms.values()) * weight
-        dr.backward(total if contribution is None else total + dr.mean(image.gbuffer.all.contribution))
+        weighed = image.gbuffer.all.contribution
+        dr.backward(total + dr.mean(weighed.x + weighed.y * loss.photometric))
         gradient = dr.grad(means2d_offset) * (photo.part / weight)  # as if all of the window had been seen
-        statistics.add(gradient, image.gbuffer.seen, photo.size, 0 if contribution is None else dr.grad(contribution))
+        statistics.add(gradient, dr.grad(contribution), image.gbuffer.seen, photo.size)
         if loss.reflective is not None:
             self.density.note_reflective(i, photo.camera, loss.reflective)
         return dr.detach(terms) | {"error": loss.error}

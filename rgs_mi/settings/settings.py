@@ -180,14 +180,22 @@ class Density:
     )
     stop: float = Field(default=0.6, ge=0, le=1, description="Fraction of the fit after which they no longer are.")
     refine_every: int = Field(default=100, ge=1, le=100_000, description="Steps from one time to the next.")
+    grow_by: Literal["gradient", "loss"] = Field(
+        default="gradient",
+        description="Which surfels of an object without surroundings grow: those of the largest positional gradients (3DGS), or "
+        "those that most of the photometric loss lies on, which are split.",
+    )
     grow_grad2d: float = Field(
         default=1e-4,
         ge=0,
         le=1,
-        description="Positional gradient, in NDC units, above which surfels grow; half of 2DGS's: rather many surfels.",
+        description="Positional gradient, in NDC units, above which they grow by gradient; half of 2DGS's: rather many surfels.",
     )
     grow_scale3d: float = Field(
-        default=0.01, ge=0, le=1, description="Surfels smaller than this, in units of the object, are cloned, others split."
+        default=0.01,
+        ge=0,
+        le=1,
+        description="Those smaller than this, in units of the object, are cloned then, others split.",
     )
     prune_opacity: float = Field(default=0.05, ge=0, le=1, description="Surfels of less opacity are removed.")
     prune_weight: float = Field(

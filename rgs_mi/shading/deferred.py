@@ -90,7 +90,7 @@ def render(
     means2d_offset: "mi.Vector2f | None" = None,
     cutoffs: Cutoffs = Cutoffs(),
     full: bool = False,
-    contribution: "mi.Float | None" = None,
+    contribution: "mi.Vector2f | None" = None,
 ) -> Image:
     """Splat ``surfels`` (see `render_gbuffer`, also for the other arguments) and `shade` them; differentiable in their
     fields, the environment and the shader."""

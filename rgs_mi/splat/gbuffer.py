@@ -29,7 +29,7 @@ class Maps:
     alpha          Σ w, coverage in [0, 1]
     delta_normal   Σ w Δn, world space
     square         Σ w z²; this and delta_normal where `render_gbuffer` was asked for all maps, else None
-    contribution   Σ w times `render_gbuffer`'s argument of that name, None without it
+    contribution   Σ w times each of `render_gbuffer`'s argument of that name, None without it
     """
 
     diffuse: "mi.Color3f"
@@ -41,7 +41,7 @@ class Maps:
     alpha: "mi.Float"
     delta_normal: "mi.Vector3f | None" = None
     square: "mi.Float | None" = None
-    contribution: "mi.Float | None" = None
+    contribution: "mi.Vector2f | None" = None
 
 
 @dataclass
@@ -73,7 +73,7 @@ class GBuffer:
     def _maps(self, m):
         """The maps that pixels' floats ``m`` are."""
         delta, m[11:] = (mi.Vector3f(*m[11:14]), m[14:]) if self.full else (None, m[11:])
-        contribution = m.pop(11) if self.weighed else None
+        contribution = mi.Vector2f(m.pop(11), m.pop(11)) if self.weighed else None
         return Maps(
             mi.Color3f(*m[0:3]),
             mi.Vector3f(*m[3:6]),
@@ -120,11 +120,12 @@ def render_gbuffer(
     means2d_offset: "mi.Vector2f | None" = None,
     cutoffs: Cutoffs = Cutoffs(),
     full: bool = False,
-    contribution: "mi.Float | None" = None,
+    contribution: "mi.Vector2f | None" = None,
 ) -> GBuffer:
     """Splat ``surfels`` into ``camera``; differentiable in all fields. ``means2d_offset`` is that of `project`; ``full`` asks
-    for the maps that only regularizers want, too. Where there is a ``contribution``, a zero for each surfel, the gradient in it
-    of the sum of the map of this name is Σ w, how much each weighs in all pixels together."""
+    for the maps that only regularizers want, too. Where there is a ``contribution``, two zeros for each surfel, the gradients in
+    it of a sum of the map of this name over pixels p, Σ_p a_p contribution_p, are Σ_p a_p w_p: how much each surfel weighs in
+    all of them together."""
     surfels = surfels.split()
     projected = project(surfels, camera, means2d_offset)
     delta = surfels.column(mi.Vector3f, "delta_normal")
@@ -135,7 +136,7 @@ def render_gbuffer(
         surfels.column(mi.Float, "roughness"),
         surfels.column(mi.Float, "metallic"),
         *(delta if full else ()),
-        *(() if contribution is None else (contribution,)),
+        *(() if contribution is None else contribution),
     ]
     dr.eval(projected.geometry, features, projected.normal_derivatives)
     isects = isect_tiles(projected, camera.size, cutoffs)

@@ -7,7 +7,7 @@ import pytest
 
 from rgs_mi.core.bounding_box import BoundingBox
 from rgs_mi.datasets.types import Dataset, View
-from rgs_mi.fit.density import Gradients, densify
+from rgs_mi.fit.density import Statistics, densify
 from rgs_mi.fit.model import Model
 from rgs_mi.priors.initialization import surroundings
 from rgs_mi.settings.settings import Density
@@ -143,9 +143,9 @@ def test_far_surfels_may_be_large():
         for name in model.optimizer.keys():
             dr.set_grad(model[name], dr.zeros(mi.TensorXf, model[name].shape))
         model.optimizer.step()
-        gradients = Gradients(3)
-        gradients.add(dr.zeros(mi.Vector2f, 3), dr.full(mi.Bool, True, 3), (100, 100))
-        densify(model, gradients, extent, Density(), np.random.default_rng(0), 10)
+        statistics = Statistics(3)
+        statistics.add(*2 * (dr.zeros(mi.Vector2f, 3),), dr.full(mi.Bool, True, 3), (100, 100))
+        densify(model, statistics, extent, Density(), np.random.default_rng(0), 10)
         return model.numpy("centers")
 
     np.testing.assert_array_equal(left(1.0), positions[:1])

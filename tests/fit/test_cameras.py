@@ -196,7 +196,7 @@ def test_poses_and_exposures_come_back():
             s = cameras.see(view, photo.camera, SETTINGS.weights)
             image = deferred.render(surfels, s.camera, lighting)
             shown = losses.display(image.color * s.gain, image.gbuffer.all.alpha, 1.0)
-            dr.backward(losses.photometric(shown, photo.color, s.camera.size, 0.2) + s.prior)
+            dr.backward(dr.mean(losses.photometric(shown, photo.color, s.camera.size, 0.2)) + s.prior)
             cameras.step(cameras.gradients(), {POSES: rate, LENSES: 0.0, EXPOSURE: 10 * rate})
     after = pose_errors([cameras.camera(k) for k in range(6)], truth)
     assert np.median(before[0]) > 0.8 and np.median(after[0]) < 0.35, (before, after)

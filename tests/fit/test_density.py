@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from rgs_mi.fit.density import Gradients, densify
+from rgs_mi.fit.density import Statistics, densify
 from rgs_mi.fit.model import ENVIRONMENT, SURFEL_PARAMETERS, Model, logit
 from rgs_mi.settings.settings import Density
 
@@ -26,8 +26,11 @@ def model():
 
 
 def gradients(values, seen=None):
-    g = Gradients(N)
-    g.sum, g.count = mi.Float(np.asarray(values, np.float32)), mi.Float(np.ones(N, np.float32) if seen is None else seen)
+    g = Statistics(N)
+    g.gradient, g.count = (
+        mi.Float(np.asarray(values, np.float32)),
+        mi.Float(np.ones(N, np.float32) if seen is None else seen),
+    )
     return g
 
 
@@ -126,12 +129,28 @@ def test_surfels_that_hardly_show_go_where_that_is_asked():
     assert np.allclose(m.numpy("centers"), centers[1:])
 
 
-def test_budget_goes_to_the_largest_gradients():
-    m = model()
+@pytest.mark.parametrize("grow_by", ["gradient", "loss"])
+def test_budget_goes_to_the_neediest(grow_by):
+    m, found = model(), gradients(np.arange(N) if grow_by == "gradient" else np.zeros(N))
     centers = m.numpy("centers")
-    densify(m, gradients(np.arange(N)), 1.0, Density(), np.random.default_rng(0), N + 3)
+    found.share = mi.Float(np.arange(N) if grow_by == "loss" else np.zeros(N))
+    densify(m, found, 1.0, Density(grow_by=grow_by), np.random.default_rng(0), N + 3)
     assert len(m) == N + 3
-    assert {tuple(c) for c in m.numpy("centers")[N:].round(5)} == {tuple(c) for c in centers[-3:].round(5)}
+    near = np.linalg.norm(m.numpy("centers")[N:, None] - centers, axis=2).argmin(1)  # of each that is new
+    assert set(near) == {N - 3, N - 2, N - 1}
+
+
+def test_none_but_those_with_more_than_their_share_grow():
+    """In the mean over the views that list them."""
+    m, found = model(), gradients(np.ones(N), np.full(N, 2))
+    share, count = np.ones(N, np.float32), np.full(N, 2, np.float32)
+    share[[4, 7]], count[5], share[6] = 3, 1, 1.2
+    found.share, found.count = mi.Float(share), mi.Float(count)
+    centers = m.numpy("centers")
+    densify(m, found, 1.0, Density(grow_by="loss"), np.random.default_rng(0), 1000)
+    assert len(m) == N + 3 and (mean := (share / count).mean()) > 0.6
+    stay = np.isclose(m.numpy("centers")[:N], centers).all(1)  # those that are split do not
+    assert (stay == (share / count <= mean)).all()
 
 
 def test_state_round_trip():

@@ -14,7 +14,7 @@ from rgs_mi.core.arrays import as_float
 from rgs_mi.datasets.photographs import Photographs
 from rgs_mi.datasets.types import DepthPrior
 from rgs_mi.fit import losses, objective, schedule
-from rgs_mi.fit.density import Gradients
+from rgs_mi.fit.density import Statistics
 from rgs_mi.fit.light_maps import STEPS, LightMaps
 from rgs_mi.fit.trainer import Fit
 from rgs_mi.settings.settings import Density, Initialization, LearningRates, Settings, Stage, Weights
@@ -101,19 +101,17 @@ def test_masks_that_may_be_wrong_show_what_lies_behind(dataset):
 
 
 def test_steps_note_what_surfels_make_of_pictures(dataset):
-    """All of them together what is covered; the losses and their gradients know nothing of it."""
-    weighing = replace(SETTINGS, density=replace(SETTINGS.density, prune_weight=0.05))
-    found = []
-    for settings in (SETTINGS, weighing):
-        fit, statistics = Fit(dataset, model(), settings, 1.0), Gradients(len(model()))
-        fit.photographs = Photographs(dataset.train, 1, 1.0)
-        loss = fit._view(3, fit.model.surfels(0), None, 1.0, statistics)
-        found.append((float(loss["loss.photometric"][0]), statistics.sum.numpy(), statistics.weight.numpy()))
-    camera = fit.photographs.tile(3).camera
-    covered = deferred.render(fit.model.surfels(0), camera, None, cutoffs=objective.CUTOFFS).gbuffer.all.alpha
-    assert found[0][0] == found[1][0]
-    np.testing.assert_allclose(found[0][1], found[1][1], rtol=1e-4, atol=1e-9)
-    assert not found[0][2].any() and found[1][2].sum() == pytest.approx(covered.numpy().mean(), rel=1e-4)
+    """All of them together what is covered, and the part of the photometric loss that is there."""
+    fit, statistics = Fit(dataset, model(), SETTINGS, 1.0), Statistics(len(model()))
+    fit.photographs = Photographs(dataset.train, 1, 1.0)
+    photo = fit.photographs.tile(3)
+    fit._view(3, fit.model.surfels(0), None, 1.0, statistics)
+    image = deferred.render(fit.model.surfels(0), photo.camera, None, cutoffs=objective.CUTOFFS)
+    covered = image.gbuffer.all.alpha.numpy()
+    loss = fit.objective(image, photo, True, 0, 0).photometric.numpy()
+    assert statistics.weight.numpy().sum() == pytest.approx(covered.mean(), rel=1e-4)
+    assert statistics.share.numpy().sum() == pytest.approx((covered * loss).mean(), rel=1e-3)
+    assert statistics.share.numpy().min() >= 0
 
 
 def test_tiles_of_a_large_window_estimate_it(dataset, monkeypatch):
@@ -128,9 +126,9 @@ def test_tiles_of_a_large_window_estimate_it(dataset, monkeypatch):
     color = np.array(whole.color).T.reshape(height, width, 3)
 
     def measured():
-        statistics = Gradients(len(fit.model))
+        statistics = Statistics(len(fit.model))
         loss = fit._view(view, fit.model.surfels(0), None, 1.0, statistics)
-        return float(loss["loss.photometric"][0]), float(loss["error"][0]), statistics.sum.numpy()
+        return float(loss["loss.photometric"][0]), float(loss["error"][0]), statistics.gradient.numpy()
 
     expected = measured()
     monkeypatch.setattr("rgs_mi.datasets.photographs.MOST_PIXELS", width * height // 3)
@@ -273,10 +271,10 @@ def test_no_kernel_is_compiled_after_warm_up(dataset, indirect, diffuse, monkeyp
         for _ in range(4):
             fit.step()
         fit.model.select(np.arange(n), {})
-        fit.density.gradients, fit.proxies = Gradients(n), None
+        fit.density.statistics, fit.proxies = Statistics(n), None
     fit.step()
     fit.model.select(np.arange(250), {})
-    fit.density.gradients, fit.proxies = Gradients(250), None
+    fit.density.statistics, fit.proxies = Statistics(250), None
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         for _ in range(8):
@@ -317,8 +315,7 @@ def test_a_view_that_overflows_does_not_end_a_fit(dataset):
     while fit.progress < 1:
         fit.step()
         errors.append(fit.psnr)
-        gradients = fit.density.gradients
-        assert np.isfinite(gradients.sum.numpy()).all() and np.isfinite(gradients.count.numpy()).all()
+        assert all(np.isfinite(array.numpy()).all() for array in fit.density.statistics.sums())
     assert np.isfinite(errors).all() and errors[-1] > errors[0] + 2
     assert all(np.isfinite(array).all() for array in fit.state()[0].values())
 

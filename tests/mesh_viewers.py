@@ -1,0 +1,115 @@
+"""How the exported mesh of a run looks in stock Mitsuba, and in Blender, against the photographs that the run has not seen.
+
+``python tests/mesh_viewers.py RUN DATA [--light kitchen] [--mesh DIR] [--views 5] [--spp 256] [--blender] [--out DIR]`` prints
+the PSNR of each view over white. DATA is the capture whose test views are the truth; ``--light``, an image or an environment of
+the suite, lights the mesh in place of its own, as that truth was lit. ``--mesh`` is a folder that `rgs-mi export --to mesh`
+wrote (otherwise one is exported), ``--blender`` asks for Cycles, too (see CONTRIBUTING.md), and ``--out`` keeps the pictures.
+"""
+
+import argparse
+import tempfile
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+
+import rgs_mi
+
+from judges import blender
+
+GRID = 4  # rays along a pixel's side that say how much of it the mesh fills
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("run", type=Path)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--light")
+    parser.add_argument("--mesh", type=Path)
+    parser.add_argument("--views", type=int, default=5)
+    parser.add_argument("--spp", type=int, default=256)
+    parser.add_argument("--blender", action="store_true")
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    rgs_mi.set_variant("llvm_ad_rgb")
+    import mitsuba as mi
+
+    from rgs_mi.commands.export import export, to_y_up
+    from rgs_mi.core.color import display
+    from rgs_mi.core.files import write_png
+    from rgs_mi.core.scene_files import load_scene
+    from rgs_mi.datasets import load_dataset
+    from rgs_mi.evaluation.metrics import psnr
+    from rgs_mi.export.mesh import gltf, stock_scene
+
+    views = load_dataset(args.data).test
+    views = [views[k] for k in sorted({round(k) for k in np.linspace(0, len(views) - 1, args.views)})]
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = args.mesh or Path(temporary)
+        if not args.mesh:
+            export(args.run, "mesh", out=folder, quiet=True)
+        light = lit_by(args.light, Path(temporary)) if args.light else folder / stock_scene.ENVIRONMENT
+        scene = mi.load_file(str(relit(folder / stock_scene.SCENE, light)), parallel=False)
+        rotation = to_y_up(load_scene(args.run / "scene.xml", {}), args.run)
+        programs = {"Mitsuba": lambda v: np.array(mi.render(scene, sensor=mi.load_dict(v.to_sensor_dict()), spp=args.spp))}
+        if args.blender:
+            programs["Blender"] = lambda v: blender(folder / gltf.NAME, light, v, rotation, Path(temporary), args.spp)
+        scores, colors = ({name: [] for name in programs} for _ in range(2))
+        for k, view in enumerate(views):
+            truth = display(view.pixels, 1)
+            alpha, behind = background(scene, view.camera)
+            pictures = [truth]
+            for name, draw in programs.items():
+                straight = (draw(view.camera)[..., :3] - behind) / np.maximum(alpha, 1 / GRID**2)
+                picture = display(np.concatenate([straight, alpha], 2).astype(np.float32), 1)
+                scores[name].append(psnr(picture, truth))
+                colors[name].append((picture * alpha).sum((0, 1)) / (truth * alpha).sum((0, 1)))
+                pictures.append(picture)
+            if args.out:
+                write_png(args.out / f"{k}.png", np.concatenate(pictures, 1))
+        for name, found in scores.items():
+            mean = ", ".join(f"{color:.3f}" for color in np.mean(colors[name], 0))
+            print(f"{name}: {np.mean(found):.2f} dB ({min(found):.1f} to {max(found):.1f}); colours {mean} of the truth's")
+
+
+def lit_by(light, folder):
+    """The file of an image, or of an environment of the suite."""
+    import mitsuba as mi
+
+    from rgs_mi.targets.environments import environment
+
+    if Path(light).is_file():
+        return Path(light).resolve()
+    mi.Bitmap(environment(light)).write(str(folder / "light.exr"))
+    return folder / "light.exr"
+
+
+def relit(path, light):
+    """A stock scene under another light: a file beside it."""
+    from rgs_mi.export.mesh.stock_scene import LIGHT
+
+    tree = ET.parse(path)
+    tree.find(f"emitter[@id='{LIGHT}']/string[@name='filename']").set("value", str(light))
+    tree.write(path.with_name("relit.xml"))
+    return path.with_name("relit.xml")
+
+
+def background(scene, camera):
+    """([H, W, 1] how much of each pixel the mesh fills, [H, W, 3] the light that the rest of it shows)."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from rgs_mi.core.camera import opaque, pixel_directions
+
+    (width, height), (fine, side) = camera.size, camera.subdivided(GRID**2)
+    direction = pixel_directions(fine, dr.arange(mi.UInt32, width * height * side**2))
+    hit = scene.ray_test(mi.Ray3f(opaque(camera).origin, direction))
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(hit))
+    si.wi = -direction
+    behind = dr.select(hit, 0, scene.environment().eval(si)).numpy().T
+    mean = lambda values: values.reshape(height, side, width, side, -1).mean((1, 3))
+    return mean(hit.numpy().astype(np.float32)), mean(behind)
+
+
+if __name__ == "__main__":
+    main()
