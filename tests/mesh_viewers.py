@@ -1,9 +1,11 @@
 """How the exported mesh of a run looks in stock Mitsuba, and in Blender, against the photographs that the run has not seen.
 
-``python tests/mesh_viewers.py RUN DATA [--light kitchen] [--mesh DIR] [--views 5] [--spp 256] [--blender] [--out DIR]`` prints
-the PSNR of each view over white. DATA is the capture whose test views are the truth; ``--light``, an image or an environment of
-the suite, lights the mesh in place of its own, as that truth was lit. ``--mesh`` is a folder that `rgs-mi export --to mesh`
-wrote (otherwise one is exported), ``--blender`` asks for Cycles, too (see CONTRIBUTING.md), and ``--out`` keeps the pictures.
+``python tests/mesh_viewers.py RUN DATA [--light kitchen] [--scene XML] [--mesh DIR] [--views 5] [--spp 256] [--blender]
+[--out DIR]`` prints the PSNR over white. DATA is the capture whose test views are the truth; ``--light``, an image or an
+environment of the suite, lights the mesh in place of its own, as that truth was lit, and ``--scene`` is the scene that it shows:
+of that, and of the mesh, all that the test views see is so far from the other (Chamfer). ``--mesh`` is a folder that `rgs-mi
+export --to mesh` wrote (otherwise one is exported), ``--blender`` asks for Cycles, too (see CONTRIBUTING.md), and ``--out``
+keeps the pictures.
 """
 
 import argparse
@@ -12,6 +14,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import KDTree
 
 import rgs_mi
 
@@ -25,6 +28,7 @@ def main():
     parser.add_argument("run", type=Path)
     parser.add_argument("data", type=Path)
     parser.add_argument("--light")
+    parser.add_argument("--scene", type=Path)
     parser.add_argument("--mesh", type=Path)
     parser.add_argument("--views", type=int, default=5)
     parser.add_argument("--spp", type=int, default=256)
@@ -43,6 +47,7 @@ def main():
     from rgs_mi.export.mesh import gltf, stock_scene
 
     views = load_dataset(args.data).test
+    cameras = [view.camera for view in views]
     views = [views[k] for k in sorted({round(k) for k in np.linspace(0, len(views) - 1, args.views)})]
     with tempfile.TemporaryDirectory() as temporary:
         folder = args.mesh or Path(temporary)
@@ -67,6 +72,11 @@ def main():
                 pictures.append(picture)
             if args.out:
                 write_png(args.out / f"{k}.png", np.concatenate(pictures, 1))
+        if args.scene:
+            there, back = apart(scene, load_scene(args.scene, {}), cameras)
+            print(
+                f"mesh to truth: {np.mean(there):.4f}, 99 % within {np.quantile(there, 0.99):.4f}; back: {np.mean(back):.4f}"
+            )
         for name, found in scores.items():
             mean = ", ".join(f"{color:.3f}" for color in np.mean(colors[name], 0))
             print(f"{name}: {np.mean(found):.2f} dB ({min(found):.1f} to {max(found):.1f}); colours {mean} of the truth's")
@@ -109,6 +119,30 @@ def background(scene, camera):
     behind = dr.select(hit, 0, scene.environment().eval(si)).numpy().T
     mean = lambda values: values.reshape(height, side, width, side, -1).mean((1, 3))
     return mean(hit.numpy().astype(np.float32)), mean(behind)
+
+
+def apart(one, other, cameras):
+    """World units from each point that ``cameras`` see of the scene ``one`` to the surface of the ``other``, and back: to the
+    plane of the nearest point that they see."""
+    (points, normals), (others, theirs) = (met(scene, cameras) for scene in (one, other))
+    away = lambda p, q, n: (lambda k: abs(((p - q[k]) * n[k]).sum(1)))(KDTree(q).query(p)[1])
+    return away(points, others, theirs), away(others, points, normals)
+
+
+def met(scene, cameras):
+    """Positions and geometric normals [N, 3] where the ``cameras`` see a ``scene``."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from rgs_mi.core.camera import opaque, pixel_directions
+
+    found = []
+    for camera in cameras:
+        index = dr.arange(mi.UInt32, camera.size[0] * camera.size[1])
+        si = scene.ray_intersect(mi.Ray3f(opaque(camera).origin, pixel_directions(camera, index)))
+        seen = si.is_valid().numpy()
+        found.append([v.numpy().T[seen] for v in (si.p, si.n)])
+    return [np.concatenate(values) for values in zip(*found)]
 
 
 if __name__ == "__main__":
