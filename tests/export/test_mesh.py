@@ -361,6 +361,20 @@ def test_refining_finds_what_was_changed(exported, monkeypatch):
     assert np.allclose(found["environment"], light, rtol=1e-3)
 
 
+@pytest.mark.parametrize("exported", [True], ids=["lit"], indirect=True)
+def test_refining_leaves_what_is_right(exported, monkeypatch):
+    """Of photographs that are the scene's own pictures nothing is to be learned, and noise teaches next to nothing."""
+    run, folder = exported
+    views = photographs_of(folder)
+    surfels = Surfels.from_numpy(read_ply(run / "object.ply"), two_sided=False)
+    ball = build(surfels, [v.camera for v in views], run, lit=True, eta=1.5, quiet=True)
+    monkeypatch.setattr(refine_module, "time", SimpleNamespace(monotonic=itertools.count().__next__))
+    names = ["base_color", "roughness", "metallic"]
+    found = refine_module.refine(folder / stock_scene.SCENE, ball.mesh, ball.texels, views, names, 60, quiet=True)
+    drift = {name: np.sqrt(np.square(found[name] - getattr(ball.textures, name)).mean()) for name in names}
+    assert max(drift.values()) < 0.004, drift
+
+
 # ---- Mistakes ----
 
 
