@@ -341,6 +341,7 @@ class Fit:
         terms |= loss.terms
         total = sum(terms.values()) * weight
         weighed = image.gbuffer.all.contribution
+        assert weighed is not None
         dr.backward(total + dr.mean(weighed.x + weighed.y * loss.photometric))
         gradient = dr.grad(means2d_offset) * (photo.part / weight)  # as if all of the window had been seen
         statistics.add(gradient, dr.grad(contribution), image.gbuffer.seen, photo.size)
