@@ -10,7 +10,6 @@ keeps the pictures.
 
 import argparse
 import tempfile
-import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
@@ -40,11 +39,13 @@ def main():
 
     from rgs_mi.commands.export import export, to_y_up
     from rgs_mi.core.color import display
-    from rgs_mi.core.files import write_png
+    from rgs_mi.core.files import write_exr, write_png
     from rgs_mi.core.scene_files import load_scene
     from rgs_mi.datasets import load_dataset
     from rgs_mi.evaluation.metrics import psnr
     from rgs_mi.export.mesh import gltf, stock_scene
+    from rgs_mi.export.relight import relight
+    from rgs_mi.shading.environment import Environment
 
     views = load_dataset(args.data).test
     cameras = [view.camera for view in views]
@@ -53,8 +54,10 @@ def main():
         folder = args.mesh or Path(temporary)
         if not args.mesh:
             export(args.run, "mesh", out=folder, quiet=True)
-        light = lit_by(args.light, Path(temporary)) if args.light else folder / stock_scene.ENVIRONMENT
-        scene = mi.load_file(str(relit(folder / stock_scene.SCENE, light)), parallel=False)
+        path, light = folder / stock_scene.SCENE, Path(temporary) / "light.exr"
+        scene = mi.load_file(str(path), parallel=False)
+        relight(scene, path, args.light)
+        write_exr(light, Environment.from_emitter(scene.environment()).texels.numpy())
         rotation = to_y_up(load_scene(args.run / "scene.xml", {}), args.run)
         programs = {"Mitsuba": lambda v: np.array(mi.render(scene, sensor=mi.load_dict(v.to_sensor_dict()), spp=args.spp))}
         if args.blender:
@@ -80,28 +83,6 @@ def main():
         for name, found in scores.items():
             mean = ", ".join(f"{color:.3f}" for color in np.mean(colors[name], 0))
             print(f"{name}: {np.mean(found):.2f} dB ({min(found):.1f} to {max(found):.1f}); colours {mean} of the truth's")
-
-
-def lit_by(light, folder):
-    """The file of an image, or of an environment of the suite."""
-    import mitsuba as mi
-
-    from rgs_mi.targets.environments import environment
-
-    if Path(light).is_file():
-        return Path(light).resolve()
-    mi.Bitmap(environment(light)).write(str(folder / "light.exr"))
-    return folder / "light.exr"
-
-
-def relit(path, light):
-    """A stock scene under another light: a file beside it."""
-    from rgs_mi.export.mesh.stock_scene import LIGHT
-
-    tree = ET.parse(path)
-    tree.find(f"emitter[@id='{LIGHT}']/string[@name='filename']").set("value", str(light))
-    tree.write(path.with_name("relit.xml"))
-    return path.with_name("relit.xml")
 
 
 def background(scene, camera):

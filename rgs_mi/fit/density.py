@@ -76,6 +76,11 @@ class DensityControl:
         self.statistics = Statistics(n)
         self.reflective: dict[int, tuple[Camera, np.ndarray]] = {}  # by view: its camera, and boxes of what is reflective
 
+    @property
+    def weighs(self) -> bool:
+        """Whether it asks for what surfels weigh in pictures, and for their shares of the loss."""
+        return self.settings.prune_weight > 0 or self.settings.grow_by == "loss"
+
     def note_reflective(self, view: int, camera: Camera, mask: np.ndarray) -> None:
         """Remember what is reflective in the view of this index, where that guides density control; ``mask`` is its β̂,
         [H, W] bool."""

@@ -333,18 +333,19 @@ class Fit:
             lighting = replace(lighting, turn=self.turns.see(photo.camera))
         means2d_offset = dr.zeros(mi.Vector2f, len(self.model))
         dr.enable_grad(means2d_offset)
-        contribution = dr.zeros(mi.Vector2f, len(self.model))
+        contribution = dr.zeros(mi.Vector2f, len(self.model)) if self.density.weighs else None
         dr.enable_grad(contribution)
         image = deferred.render(surfels, photo.camera, lighting, means2d_offset, CUTOFFS, self.objective.full, contribution)
         consistency = self.schedule.value(self.settings.weights.consistency, self.progress)
         loss = self.objective(image, photo, self.dataset.train[i].masked, consistency, self.step_number, gain)
         terms |= loss.terms
         total = sum(terms.values()) * weight
-        weighed = image.gbuffer.all.contribution
-        assert weighed is not None
-        dr.backward(total + dr.mean(weighed.x + weighed.y * loss.photometric))
+        if (weighed := image.gbuffer.all.contribution) is not None:
+            total += dr.mean(weighed.x + weighed.y * loss.photometric)
+        dr.backward(total)
         gradient = dr.grad(means2d_offset) * (photo.part / weight)  # as if all of the window had been seen
-        statistics.add(gradient, dr.grad(contribution), image.gbuffer.seen, photo.size)
+        found = mi.Vector2f(0) if contribution is None else dr.grad(contribution)
+        statistics.add(gradient, found, image.gbuffer.seen, photo.size)
         if loss.reflective is not None:
             self.density.note_reflective(i, photo.camera, loss.reflective)
         return dr.detach(terms) | {"error": loss.error}

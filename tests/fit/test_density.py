@@ -27,10 +27,8 @@ def model():
 
 def gradients(values, seen=None):
     g = Statistics(N)
-    g.gradient, g.count = (
-        mi.Float(np.asarray(values, np.float32)),
-        mi.Float(np.ones(N, np.float32) if seen is None else seen),
-    )
+    g.gradient = mi.Float(np.asarray(values, np.float32))
+    g.count = mi.Float(np.ones(N, np.float32) if seen is None else seen)
     return g
 
 
@@ -129,12 +127,19 @@ def test_surfels_that_hardly_show_go_where_that_is_asked():
     assert np.allclose(m.numpy("centers"), centers[1:])
 
 
-@pytest.mark.parametrize("grow_by", ["gradient", "loss"])
-def test_budget_goes_to_the_neediest(grow_by):
-    m, found = model(), gradients(np.arange(N) if grow_by == "gradient" else np.zeros(N))
+def test_budget_goes_to_the_largest_gradients():
+    m = model()
     centers = m.numpy("centers")
-    found.share = mi.Float(np.arange(N) if grow_by == "loss" else np.zeros(N))
-    densify(m, found, 1.0, Density(grow_by=grow_by), np.random.default_rng(0), N + 3)
+    densify(m, gradients(np.arange(N)), 1.0, Density(), np.random.default_rng(0), N + 3)
+    assert len(m) == N + 3
+    assert {tuple(c) for c in m.numpy("centers")[N:].round(5)} == {tuple(c) for c in centers[-3:].round(5)}
+
+
+def test_budget_goes_to_the_largest_shares():
+    m, found = model(), gradients(np.zeros(N))
+    centers = m.numpy("centers")
+    found.share = mi.Float(np.arange(N))
+    densify(m, found, 1.0, Density(grow_by="loss"), np.random.default_rng(0), N + 3)
     assert len(m) == N + 3
     near = np.linalg.norm(m.numpy("centers")[N:, None] - centers, axis=2).argmin(1)  # of each that is new
     assert set(near) == {N - 3, N - 2, N - 1}

@@ -101,11 +101,19 @@ def test_masks_that_may_be_wrong_show_what_lies_behind(dataset):
 
 
 def test_steps_note_what_surfels_make_of_pictures(dataset):
-    """All of them together what is covered, and the part of the photometric loss that is there."""
-    fit, statistics = Fit(dataset, model(), SETTINGS, 1.0), Statistics(len(model()))
-    fit.photographs = Photographs(dataset.train, 1, 1.0)
+    """All of them together what is covered, and the part of the photometric loss that is there; the losses and their gradients
+    know nothing of it."""
+    weighing = replace(SETTINGS, density=replace(SETTINGS.density, prune_weight=0.05))
+    found = []
+    for settings in (SETTINGS, weighing):
+        fit, statistics = Fit(dataset, model(), settings, 1.0), Statistics(len(model()))
+        fit.photographs = Photographs(dataset.train, 1, 1.0)
+        loss = fit._view(3, fit.model.surfels(0), None, 1.0, statistics)
+        found.append((float(loss["loss.photometric"][0]), statistics.gradient.numpy()))
+        assert settings is weighing or not (statistics.weight.numpy().any() or statistics.share.numpy().any())
+    assert found[0][0] == found[1][0]
+    np.testing.assert_allclose(found[0][1], found[1][1], rtol=1e-4, atol=1e-9)
     photo = fit.photographs.tile(3)
-    fit._view(3, fit.model.surfels(0), None, 1.0, statistics)
     image = deferred.render(fit.model.surfels(0), photo.camera, None, cutoffs=objective.CUTOFFS)
     covered = image.gbuffer.all.alpha.numpy()
     loss = fit.objective(image, photo, True, 0, 0).photometric.numpy()
