@@ -59,7 +59,7 @@ def main():
         relight(scene, path, args.light)
         write_exr(light, Environment.from_emitter(scene.environment()).texels.numpy())
         rotation = to_y_up(load_scene(args.run / "scene.xml", {}), args.run)
-        programs = {"Mitsuba": lambda v: np.array(mi.render(scene, sensor=mi.load_dict(v.to_sensor_dict()), spp=args.spp))}
+        programs = {"Mitsuba": lambda v: np.array(mi.render(scene, sensor=filmed(v), spp=args.spp))}
         if args.blender:
             programs["Blender"] = lambda v: blender(folder / gltf.NAME, light, v, rotation, Path(temporary), args.spp)
         scores, colors = ({name: [] for name in programs} for _ in range(2))
@@ -85,8 +85,17 @@ def main():
             print(f"{name}: {np.mean(found):.2f} dB ({min(found):.1f} to {max(found):.1f}); colours {mean} of the truth's")
 
 
+def filmed(camera):
+    """The sensor of a ``camera`` whose film is that of the photographs: Mitsuba's own, Gaussian, of 0.5 pixels."""
+    import mitsuba as mi
+
+    sensor = camera.to_sensor_dict()
+    sensor["film"]["rfilter"] = {"type": "gaussian"}
+    return mi.load_dict(sensor)
+
+
 def background(scene, camera):
-    """([H, W, 1] how much of each pixel the mesh fills, [H, W, 3] the light that the rest of it shows)."""
+    """([H, W, 1] how much of each pixel the mesh fills, [H, W, 3] the light that the rest of it shows), on that film."""
     import drjit as dr
     import mitsuba as mi
 
@@ -98,8 +107,22 @@ def background(scene, camera):
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(hit))
     si.wi = -direction
     behind = dr.select(hit, 0, scene.environment().eval(si)).numpy().T
-    mean = lambda values: values.reshape(height, side, width, side, -1).mean((1, 3))
-    return mean(hit.numpy().astype(np.float32)), mean(behind)
+    film = lambda values: _film(values.reshape(height * side, width * side, -1), side)
+    return film(hit.numpy().astype(np.float32)), film(behind)
+
+
+def _film(values, side):
+    """[H, W, channels] of ``side`` × ``side`` values a pixel: what Mitsuba's Gaussian filter makes of them."""
+    from scipy import ndimage
+
+    reach = 2 * side  # its radius is four standard deviations
+    offset = (np.arange(-reach, reach) + 0.5) / side
+    weight = np.maximum(np.exp(-2 * offset**2) - np.exp(-8), 0)
+    weight /= weight.sum()
+    for axis in (0, 1):  # an even number of weights about the middle of a pixel, which lies between two values
+        values = ndimage.correlate1d(values, weight, axis, mode="nearest", origin=0)
+        values = np.take(values, np.arange(side // 2, values.shape[axis], side), axis)
+    return values
 
 
 def apart(one, other, cameras):

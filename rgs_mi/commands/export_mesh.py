@@ -12,7 +12,10 @@ from ..core.errors import UserError
 from ..datasets import load_dataset
 from ..export.mesh import gltf, stock_scene
 from ..export.mesh.build import build
-from ..export.mesh.refine import Photograph, refine
+from ..export.mesh.fit import fitted
+from ..export.mesh.photographs import Photograph
+from ..export.mesh.refine import refine
+from ..export.relight import light_diffuse
 from ..plugins import lit_surfels, surfels_of
 from ..report import cameras, results
 from ..shading.environment import Environment
@@ -40,6 +43,7 @@ def export_mesh(
     Raises: UserError for a run without surfels or, with ``minutes``, without photographs or environment, and where a package is
     missing or a file can't be written.
     """
+    light_diffuse(scene)
     surfels, lighting = lit_surfels(scene, path)
     if not len(surfels):
         raise UserError(f"{path}: its shape of surfels is empty: there is nothing to export")
@@ -50,9 +54,13 @@ def export_mesh(
     _tell_what_is_lost(path, scene, lighting)
     photographs = _photographs(run, data, needed=bool(minutes))
     seen = [p.camera for p in photographs] or [Camera.from_sensor(sensor) for sensor in scene.sensors()]
-    lit = lighting is not None and scene.integrator().diffuse != "radiance"  # also where base colors stand beside a radiance
+    lit = lighting is not None and lighting.lit
     eta = surfels_of(scene, path).eta
-    result = build(surfels, seen, path, lit=lit, eta=eta, box=lighting and lighting.box, quiet=quiet)
+    splatted = lighting.as_splatted(surfels) if lit else surfels
+    result = build(splatted, seen, path, lit=lit, eta=eta, box=lighting and lighting.box, quiet=quiet)
+    if lit and photographs:
+        own = fitted(result.textures, result.mesh, result.texels, result.radiance, photographs, lighting, quiet)
+        result = replace(result, textures=own)
     environment = Environment.from_emitter(emitter).texels.numpy() if mapped else None
     write = lambda: stock_scene.write(folder, result.mesh, result.texels, result.textures, eta, environment, path)
     paths = write()

@@ -38,15 +38,15 @@ def relight(
     if brighten:
         params["scale"] = params["scale"] * 2.0**brighten
     if envmap is not None or rotate or brighten:
-        _light_diffuse(scene)
+        light_diffuse(scene)
     to_world = np.array(params["to_world"].matrix).reshape(4, 4)
     to_world[:3, :3] = to_world[:3, :3] @ about_vertical(rotate)
     params["to_world"] = mi.Transform4f(mi.ScalarTransform4f(to_world))
     params.update()
 
 
-def _light_diffuse(scene):
-    """Have base colors, where they are known, make the diffuse radiance from now on."""
+def light_diffuse(scene: "mi.Scene") -> None:
+    """Have base colors, where they are known, make the diffuse radiance of the ``scene``'s surfels from now on."""
     integrator = scene.integrator()
     if is_deferred(integrator) and integrator.diffuse == "relightable" and integrator.specular != "none":
         integrator.diffuse = "lit"
@@ -87,7 +87,7 @@ def edit(scene: "mi.Scene", path: str | Path, changes: Sequence[str]) -> None:
     for name, values in edited(arrays, changes).items():
         params[name] = as_tensor(values)
     params.update()
-    _light_diffuse(scene)
+    light_diffuse(scene)
 
 
 def edited(arrays: Mapping[str, np.ndarray], changes: Iterable[str]) -> dict[str, np.ndarray]:

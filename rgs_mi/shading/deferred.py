@@ -78,7 +78,7 @@ def _reflected(gbuffer, camera, lighting):
         surface = Surface(normal, -direction, m.roughness * mean, m.metallic * mean, m.base_color * mean, point)
         dr.scatter(specular, lighting.specular(surface) * m.alpha, index)
         if lighting.lit:
-            lit = lighting.diffuse(surface, lighting.irradiance_visibility(m, mean))
+            lit = lighting.diffuse(surface, lighting.irradiance_visibility(m.diffuse * mean))
             dr.scatter(diffuse, lit * m.alpha, index)
     return diffuse, specular
 

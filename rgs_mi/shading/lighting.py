@@ -9,7 +9,6 @@ import mitsuba as mi
 from ..core.bounding_box import BoundingBox
 from ..core.camera import Camera
 from ..core.turntable import Turntable
-from ..splat.gbuffer import Maps
 from ..surfels.proxies import Proxies
 from ..surfels.surfels import Surfels
 from .environment import FilteredEnvironment, IncidentRadiance
@@ -164,9 +163,9 @@ class Lighting:
         indirect = self._with_visibility
         return surfels if indirect is None else indirect.with_visibility_as_radiance(surfels, self.box)
 
-    def irradiance_visibility(self, maps: Maps, mean: "mi.Float") -> "mi.Color3f | float":
-        """Return the irradiance visibility of pixels of these ``maps``, which ``mean`` divides by their coverage."""
-        return 1 if self._with_visibility is None else maps.diffuse * mean
+    def irradiance_visibility(self, radiance: "mi.Color3f") -> "mi.Color3f | float":
+        """Return the irradiance visibility where surfels `as_splatted` have this ``radiance``."""
+        return 1 if self._with_visibility is None else radiance
 
     def for_secondary_bounce(self) -> "Lighting":
         """Return the lighting of what a reflected ray meets, which lies in the box: it reflects the environment alone."""

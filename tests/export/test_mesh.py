@@ -12,6 +12,8 @@ from types import SimpleNamespace
 import mitsuba as mi
 import numpy as np
 import pytest
+from rgs_mi.plugins import lit_surfels
+from scipy.ndimage import map_coordinates
 from scipy.spatial import KDTree
 
 import rgs_mi
@@ -20,20 +22,23 @@ from rgs_mi.core.arrays import as_float
 from rgs_mi.core.camera import Camera
 from rgs_mi.core.color import srgb_encode
 from rgs_mi.core.errors import UserError
+from rgs_mi.core.scene_files import load_scene
 from rgs_mi.datasets.path_traced import train_directions
-from rgs_mi.export.mesh import gltf, stock_scene, tsdf
+from rgs_mi.evaluation.evaluate import render_view
+from rgs_mi.export.mesh import gltf, outlines, stock_scene, tsdf
 from rgs_mi.export.mesh import refine as refine_module
 from rgs_mi.export.mesh.build import build
 from rgs_mi.export.mesh.depth_maps import depth_map
-from rgs_mi.export.mesh.refine import Photograph
-from rgs_mi.export.mesh.surface import UVMesh, largest_parts, simplified, smoothed
+from rgs_mi.export.mesh.fit import _Maps, fitted
+from rgs_mi.export.mesh.photographs import Photograph
+from rgs_mi.export.mesh.surface import UVMesh, as_mitsuba, largest_parts, simplified, smoothed
 from rgs_mi.export.mesh.textures import Texels, gltf_frames, mitsuba_frames, normal_map, vertex_tangents
 from rgs_mi.export.splats import fibonacci_sphere
 from rgs_mi.splat.reference import median_depth_reference
 from rgs_mi.splat.tiles import Cutoffs
 from rgs_mi.surfels.ply import read_ply, write_ply
 from rgs_mi.surfels.surfels import Surfels, rotation_from_normal
-from rgs_mi.targets.meshes import join, unit
+from rgs_mi.targets.meshes import Mesh, join, unit
 
 from judges import blender, package, validated_gltf
 from scenes import orbit_camera, sphere_surfels, tangent_surfels
@@ -149,6 +154,34 @@ def test_smoothing_keeps_to_the_normals(sphere):
     spread = lambda m: np.linalg.norm(m.vertices, axis=1).std()
     assert spread(smooth) < 0.5 * spread(rough)
     assert abs(np.linalg.norm(smooth.vertices, axis=1).mean() - 1) < 0.3 * VOXEL
+
+
+@pytest.mark.parametrize("radius", [0.97, 1.02])
+def test_outlines_are_those_of_coverages(radius):
+    """A sphere of another radius comes to that of coverages, wherever cameras see it, by a small part of a pixel, 0.046."""
+    views = cameras(size=64)
+    truth = icosphere(1.0)
+    coverages = [outlines._coverage(scene_of(truth), camera) for camera in views]
+    found = outlines.aligned(icosphere(radius), views, coverages)
+    error = np.linalg.norm(found.vertices, axis=1) - 1
+    assert abs(error.mean()) < 0.003 and abs(error).max() < 0.012
+    assert (unit(found.vertices) * found.normals).sum(1).min() > 0.999
+
+
+def test_what_fills_the_picture_has_no_outline():
+    mesh, views = icosphere(1.0), cameras(3)
+    found = outlines.aligned(mesh, views, [np.ones((SIZE, SIZE), np.float32)] * len(views))
+    assert np.array_equal(found.vertices, mesh.vertices)
+
+
+def icosphere(radius):
+    """A sphere of triangles."""
+    mesh = pytest.importorskip("trimesh").creation.icosphere(4, radius)
+    return Mesh(np.float32(mesh.vertices), np.uint32(mesh.faces), np.float32(unit(mesh.vertices)))
+
+
+def scene_of(mesh):
+    return mi.load_dict({"type": "scene", "mesh": as_mitsuba(mesh)})
 
 
 def test_simplified(sphere):
@@ -273,7 +306,7 @@ def test_stock_mitsuba_shows_what_we_show(exported, tmp_path):
     done = subprocess.run(arguments, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     scene = mi.load_file(str(run / "scene.xml"), parallel=False)
-    ours = np.stack([np.array(mi.render(scene, sensor=k, spp=4))[..., :3] for k in (0, 5)])
+    ours = np.stack([np.array(mi.render(scene, sensor=k, spp=1))[..., :3] for k in (0, 5)])  # as fits have outlines
     theirs = np.load(tmp_path / "stock.npy")
     shown = [srgb_encode(np.clip(image, 0, 1)) for image in (ours, theirs)]
     assert -10 * np.log10(np.mean((shown[0] - shown[1]) ** 2)) > 30
@@ -339,6 +372,42 @@ def test_what_is_relightable_is_lit(exported, tmp_path):
     assert sorted(path.name for path in found.iterdir()) == sorted(path.name for path in folder.iterdir())
     colors = [np.float32(np.array(mi.Bitmap(str(path / "base_color.exr")))) for path in (found, folder)]
     assert np.allclose(*colors, atol=1e-3) and colors[0].std() > 0.05
+
+
+@pytest.mark.parametrize("exported", [True], ids=["lit"], indirect=True)
+def test_textures_are_fitted_to_photographs(exported):
+    """Base colors that were darkened, and metallic that was washed out, come back, of photographs that show the surfels."""
+    run, _ = exported
+    scene = load_scene(run / "scene.xml", {})
+    surfels, lighting = lit_surfels(scene, run)
+    views = []
+    for camera in cameras():
+        seen = render_view(surfels, lighting, camera, 0.0, 4)
+        color = seen.maps["color"] / np.maximum(seen.alpha, 1e-3)
+        views.append(Photograph(camera, np.concatenate([color, seen.alpha > 0.9], 2).astype(np.float32), np.full(3, 0.5)))
+        views[-1].pixels[..., :3] *= 0.5  # its exposure
+    ball = build(lighting.as_splatted(surfels), [v.camera for v in views], run, lit=True, eta=1.5, quiet=True)
+    truth = ball.textures
+    spoiled = replace(truth, base_color=0.7 * truth.base_color, metallic=0.8 * truth.metallic + 0.1)
+    found = fitted(spoiled, ball.mesh, ball.texels, ball.radiance, views, lighting, quiet=True)
+    for name in ("base_color", "metallic"):
+        error = lambda textures: abs(getattr(textures, name) - getattr(truth, name)).mean()
+        assert error(found) < 0.4 * error(spoiled), (name, error(found), error(spoiled))
+    assert found.roughness is truth.roughness and found.normal is truth.normal
+
+
+def test_means_over_the_rays_of_a_pixel():
+    """Of textures that are linear between texels, those that no face has being like others."""
+    rng, (width, height) = np.random.default_rng(0), (7, 5)
+    like, known, own = rng.integers(0, 9, width * height), rng.random((9, 8), np.float32), rng.random((9, 4), np.float32)
+    maps = _Maps(mi.UInt32(like.astype(np.uint32)), (width, height), as_float(known))
+    uv = rng.uniform(0.12, 0.88, (4, 50, 2))
+    corners = [c for ray in uv for c in maps.corners(mi.Point2f(*(as_float(ray[:, k]) for k in (0, 1))))]
+    found = np.concatenate([np.atleast_2d(v.numpy()) for v in maps.means(corners, as_float(own))])
+    image = np.concatenate([own, known[:, :7]], 1)[like].reshape(height, width, -1)
+    at = (uv[..., 1].ravel() * height - 0.5, uv[..., 0].ravel() * width - 0.5)
+    expected = [map_coordinates(image[..., k], at, order=1).reshape(4, -1).mean(0) for k in range(11)]
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("exported", [False], ids=["radiance"], indirect=True)

@@ -12,8 +12,9 @@ from ...core.errors import UserError
 from ...core.progress import Progress
 from ...surfels.surfels import Surfels
 from . import tsdf
-from .depth_maps import depth_map
+from .depth_maps import coverage_map, depth_map
 from .lookup import look_up
+from .outlines import aligned
 from .surface import UVMesh, largest_parts, simplified, smoothed, unwrapped
 from .textures import Texels, Textures, textures
 
@@ -24,11 +25,12 @@ _TOLERANCE = 2.0  # voxels between a camera's depth map and what it sees
 
 @dataclass(frozen=True)
 class TexturedMesh:
-    """A mesh and its textures, which are known at its ``texels``."""
+    """A mesh and its textures, which are known at its ``texels``; ``radiance`` [H, W, 3] is the texture of the surfels' own."""
 
     mesh: UVMesh
     texels: Texels
     textures: Textures
+    radiance: np.ndarray
 
 
 def build(
@@ -63,13 +65,15 @@ def build(
         )
         dense = smoothed(dense, _normals(dense, look, 0.4, 0.6))
         mesh = simplified(dense, min(_MOST_FACES, int(_FACES * len(dense.faces))))
+        progress.update(0.62)
+        mesh = aligned(mesh, cameras, [coverage_map(surfels, camera) for camera in cameras])
         progress.update(0.65)
         mesh = replace(mesh, normals=_normals(mesh, look, 0.65, 0.7))
         uv = unwrapped(mesh, _TEXEL * volume.voxel)
         progress.update(0.8)
         texels = Texels.of(uv)
         seen = look(texels.points, texels.normals, 0.8, 1.0)
-    return TexturedMesh(uv, texels, textures(uv, texels, seen, lit, eta))
+    return TexturedMesh(uv, texels, textures(uv, texels, seen, lit, eta), texels.filled(seen.radiance, seen.known))
 
 
 def _normals(mesh, look, first, last):

@@ -24,10 +24,10 @@ import numpy as np
 from skimage.transform import downscale_local_mean
 
 from ...core.arrays import as_float, as_tensor
-from ...core.camera import Camera, opaque, pixel_directions
-from ...core.color import srgb_decode
+from ...core.camera import opaque, pixel_directions
 from ...core.interrupt import GracefulInterrupt
 from ...core.progress import Progress
+from .photographs import SATURATED, Photograph
 from .stock_scene import LIGHT
 from .surface import UVMesh
 from .textures import Texels
@@ -37,17 +37,8 @@ _LONGEST = 256  # pixels along a photograph's longer side, at most
 _RATES = {"base_color": 5e-4, "roughness": 5e-4, "metallic": 5e-4, "radiance": 5e-4, "environment": 2e-3}  # or noise leads
 _LAST = 0.1  # learning rates at the end, over those at the start
 _LIGHTS = (16, 32)  # rows and columns of the environment's factors
-_DARK, _SATURATED = 0.02, 0.98  # linear values up to which the slope is that; from which photographs are white
+_DARK = 0.02  # linear value up to which the slope is that
 _GRID = 4  # rays along a pixel's side that say whether the mesh fills it
-
-
-@dataclass(frozen=True)
-class Photograph:
-    """What one camera took: ``pixels`` [H, W, 4], those of a `View`, with a ``gain`` [3] (None: 1)."""
-
-    camera: Camera
-    pixels: np.ndarray
-    gain: np.ndarray | None = None
 
 
 def refine(
@@ -153,28 +144,22 @@ def _assign(params, learned, optimizer):
 class _Target:
     sensor: "mi.Sensor"
     linear: "mi.TensorXf"  # [H, W, 3]
-    weight: "mi.TensorXf"  # [H, W, 3]: s' where the mesh fills the pixel, else 0
-    white: "mi.TensorXf"  # [H, W, 3]: 1 where the photograph is
+    weight: "mi.TensorXf"  # [H, W, 1]: 1 where the mesh fills the pixel, else 0
     gain: "mi.TensorXf"  # [1, 1, 3]
     filled: float  # part of the pixels
 
 
 def _target(scene, photograph):
-    pixels = photograph.pixels.astype(np.float32) / (255 if photograph.pixels.dtype == np.uint8 else 1)
-    pixels[..., :3] = srgb_decode(pixels[..., :3]) if photograph.pixels.dtype == np.uint8 else np.clip(pixels[..., :3], 0, 1)
     side = -(-max(photograph.camera.size) // _LONGEST)
     width, height = (n // side for n in photograph.camera.size)
     camera = photograph.camera.cropped(0, 0, width * side, height * side).resized(width, height)
-    pixels = downscale_local_mean(pixels[: height * side, : width * side], (side, side, 1))
-    linear, filled = pixels[..., :3], (pixels[..., 3] > 0.999) & _filled(scene, camera)
-    slope = 1.055 / 2.4 * np.maximum(linear, _DARK) ** (1 / 2.4 - 1)
-    gain = np.ones(3) if photograph.gain is None else photograph.gain
+    smaller = lambda values: downscale_local_mean(values[: height * side, : width * side], (side, side, 1))
+    filled = (smaller(photograph.object[..., None]) == 1) & _filled(scene, camera)[..., None]
     return _Target(
         mi.load_dict(camera.to_sensor_dict()),
-        as_tensor(linear),
-        as_tensor(slope * filled[..., None]),
-        as_tensor(linear >= _SATURATED),
-        as_tensor(np.reshape(gain, (1, 1, 3))),
+        as_tensor(smaller(photograph.radiance)),
+        as_tensor(filled),
+        as_tensor(np.reshape(photograph.exposure, (1, 1, 3))),
         float(filled.mean()),
     )
 
@@ -199,8 +184,10 @@ def _step(scene, params, integrator, target, seed):
         seed=2 * seed,
         seed_grad=2 * seed + 1,
     )
-    residual = image[..., :3] * target.gain - target.linear
-    residual = dr.select((target.white > 0) & (residual > 0), 0, residual) * target.weight  # cut off, noise would be a bias
-    loss = dr.sum(dr.square(residual), axis=None) / dr.opaque(mi.Float, len(residual.array) * max(target.filled, 1e-3))
+    error = image[..., :3] * target.gain - target.linear
+    white = (target.linear >= SATURATED) & (error > 0)
+    slope = 1.055 / 2.4 * dr.maximum(target.linear, _DARK) ** (1 / 2.4 - 1)
+    error = dr.select(white, 0, error) * slope * target.weight  # cut off, noise would be a bias
+    loss = dr.sum(dr.square(error), axis=None) / dr.opaque(mi.Float, len(error.array) * max(target.filled, 1e-3))
     dr.backward(loss)
     return float(loss.array[0])

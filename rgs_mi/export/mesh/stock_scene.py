@@ -17,9 +17,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from ...core.arrays import as_float
 from ...core.files import atomic_file, write_bitmap, write_exr
-from .surface import UVMesh
+from .surface import UVMesh, as_mitsuba
 from .textures import Texels, Textures, mitsuba_frames, normal_map
 
 SCENE, MESH, ENVIRONMENT = "scene.xml", "mesh.ply", "environment.exr"
@@ -70,13 +69,8 @@ def _write_half(path, image):
 
 
 def _write_ply(path, mesh):
-    own = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True, has_vertex_texcoords=True)
-    params = mi.traverse(own)
-    params["vertex_positions"], params["vertex_normals"] = as_float(mesh.vertices), as_float(mesh.normals)
-    params["vertex_texcoords"], params["faces"] = as_float(mesh.uv), mi.UInt32(mesh.faces.ravel())
-    params.update()
     memory = mi.MemoryStream()
-    own.write_ply(memory)
+    as_mitsuba(mesh).write_ply(memory)
     with atomic_file(path) as stream:
         stream.write(memory.raw_buffer())
 

@@ -5,9 +5,11 @@ import importlib
 from dataclasses import dataclass
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from scipy import sparse
 
+from ...core.arrays import as_float
 from ...core.errors import UserError
 from ...targets.meshes import Mesh, weld
 
@@ -72,6 +74,19 @@ def packages(*names: str) -> list[Any]:
         return [importlib.import_module(name) for name in names]
     except ImportError as error:
         raise UserError("--to mesh: packages are missing: pip install 'rgs-mi[mesh]'") from error
+
+
+def as_mitsuba(mesh: "Mesh | UVMesh") -> "mi.Mesh":
+    """Return a ``mesh`` as Mitsuba's, with normals and, where it has them, texture coordinates."""
+    uv = mesh.uv if isinstance(mesh, UVMesh) else None
+    own = mi.Mesh("mesh", len(mesh.vertices), len(mesh.faces), has_vertex_normals=True, has_vertex_texcoords=uv is not None)
+    params = mi.traverse(own)
+    params["vertex_positions"], params["vertex_normals"] = as_float(mesh.vertices), as_float(mesh.normals)
+    if uv is not None:
+        params["vertex_texcoords"] = as_float(uv)
+    params["faces"] = mi.UInt32(mesh.faces.ravel())
+    params.update()
+    return own
 
 
 # ---- On a plane ----

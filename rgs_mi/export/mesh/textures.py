@@ -17,11 +17,10 @@ import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 
-from ...core.arrays import as_float
 from ...shading.tables import normal_reflectance
-from ...targets.meshes import unit
+from ...targets.meshes import Mesh, unit
 from .lookup import Seen
-from .surface import UVMesh
+from .surface import UVMesh, as_mitsuba
 
 
 @dataclass(frozen=True)
@@ -56,14 +55,11 @@ class Texels:
     @classmethod
     def of(cls, mesh: UVMesh) -> "Texels":
         """Find the texels of a ``mesh``: rays meet its plane at their centers."""
-        (width, height), flat = mesh.size, mi.Mesh("charts", len(mesh.vertices), len(mesh.faces))
-        params = mi.traverse(flat)
-        params["vertex_positions"] = as_float(np.column_stack([mesh.uv, np.zeros(len(mesh.uv))]))
-        params["faces"] = mi.UInt32(mesh.faces.ravel())
-        params.update()
+        width, height = mesh.size
+        flat = Mesh(np.column_stack([mesh.uv, np.zeros(len(mesh.uv))]), mesh.faces, mesh.normals)
         k = dr.arange(mi.UInt32, width * height)
         origin = mi.Point3f((mi.Float(k % width) + 0.5) / width, (mi.Float(k // width) + 0.5) / height, 1)
-        plane = mi.load_dict({"type": "scene", "charts": flat})
+        plane = mi.load_dict({"type": "scene", "charts": as_mitsuba(flat)})
         hit = plane.ray_intersect_preliminary(mi.Ray3f(origin, mi.Vector3f(0, 0, -1)))
         index = np.flatnonzero(hit.is_valid().numpy())
         face, b = hit.prim_index.numpy()[index], hit.prim_uv.numpy().T[index].astype(float)
@@ -84,12 +80,17 @@ class Texels:
         row, column = np.asarray(ndimage.distance_transform_edt(number < 0, return_distances=False, return_indices=True))
         return number[row, column].ravel()
 
+    def filled(self, values: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """Return the texture [H, W, channels] of ``values`` [T, channels]; where they are not ``known`` [T] it is like the
+        nearest that are."""
+        near = self.nearest(known) if known.any() else self.near
+        return values[near].reshape(*self.size[::-1], -1).astype(np.float32)
+
 
 def textures(mesh: UVMesh, texels: Texels, seen: Seen, lit: bool, eta: float) -> Textures:
     """Return the `Textures` of a ``mesh`` from what was ``seen`` at its ``texels``; ``lit`` says whether surfels have no radiance
     of their own, and ``eta`` is their index of refraction. What no camera sees is like the nearest that one does."""
-    near = texels.nearest(seen.known) if seen.known.any() else texels.near
-    filled = lambda values: values[near].reshape(*mesh.size[::-1], -1).astype(np.float32)
+    filled = lambda values: texels.filled(values, seen.known)
     base_color, metallic = np.clip(seen.base_color, 0, 1), np.clip(seen.metallic, 0, 1)
     if not lit:
         base_color, metallic = metallic * base_color + (1 - metallic) * normal_reflectance(eta), np.ones_like(metallic)
