@@ -40,7 +40,7 @@ scene.camera.matrix_world = to_blender @ mathutils.Matrix(view["to_world"]) @ fl
 scene.render.engine = "CYCLES"
 scene.cycles.device, scene.cycles.samples, scene.cycles.use_denoising = "CPU", int(samples), False
 scene.cycles.use_adaptive_sampling = False
-scene.cycles.pixel_filter_type = "BOX"
+scene.cycles.pixel_filter_type, scene.cycles.filter_width = "GAUSSIAN", 2.0  # a quarter of it is its standard deviation
 scene.cycles.max_bounces = scene.cycles.diffuse_bounces = scene.cycles.glossy_bounces = 5
 scene.cycles.sample_clamp_indirect = 0
 scene.render.resolution_x, scene.render.resolution_y = view["size"]

@@ -54,6 +54,14 @@ def splat_transform(*arguments) -> str:
     return run_node(package("@playcanvas/splat-transform") / "bin" / "cli.mjs", "-w", *arguments, new=True)
 
 
+def filmed(camera) -> "mi.Sensor":
+    """The sensor of a `Camera` whose film is Mitsuba's own, as photographs of the suite have it, and Blender here: Gaussian, of
+    half a pixel."""
+    sensor = camera.to_sensor_dict()
+    sensor["film"]["rfilter"] = {"type": "gaussian"}
+    return mi.load_dict(sensor)
+
+
 def blender(glb: Path, light: Path, camera, rotation, folder: Path, samples: int = 64) -> np.ndarray:
     """What Blender's Cycles shows to a `Camera` of a GLB under the environment map ``light``, linear, [H, W, 3]; ``rotation``
     [3, 3] takes the camera's world to the glTF's. Files between are in ``folder``."""

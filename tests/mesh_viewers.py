@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 import rgs_mi
 
-from judges import blender
+from judges import blender, filmed
 
 GRID = 4  # rays along a pixel's side that say how much of it the mesh fills
 
@@ -83,15 +83,6 @@ def main():
         for name, found in scores.items():
             mean = ", ".join(f"{color:.3f}" for color in np.mean(colors[name], 0))
             print(f"{name}: {np.mean(found):.2f} dB ({min(found):.1f} to {max(found):.1f}); colours {mean} of the truth's")
-
-
-def filmed(camera):
-    """The sensor of a ``camera`` whose film is that of the photographs: Mitsuba's own, Gaussian, of 0.5 pixels."""
-    import mitsuba as mi
-
-    sensor = camera.to_sensor_dict()
-    sensor["film"]["rfilter"] = {"type": "gaussian"}
-    return mi.load_dict(sensor)
 
 
 def background(scene, camera):

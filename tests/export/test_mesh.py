@@ -40,7 +40,7 @@ from rgs_mi.surfels.ply import read_ply, write_ply
 from rgs_mi.surfels.surfels import Surfels, rotation_from_normal
 from rgs_mi.targets.meshes import Mesh, join, unit
 
-from judges import blender, package, validated_gltf
+from judges import blender, filmed, package, validated_gltf
 from scenes import orbit_camera, sphere_surfels, tangent_surfels
 from variants import VARIANT
 
@@ -338,7 +338,7 @@ def test_blender_shows_what_mitsuba_shows(exported, tmp_path):
     scene = mi.load_file(str(folder / stock_scene.SCENE), parallel=False)
     camera, rotation = Camera.from_sensor(scene.sensors()[5]), np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     theirs = blender(folder / gltf.NAME, folder / stock_scene.ENVIRONMENT, camera, rotation, tmp_path)
-    ours = np.array(mi.render(scene, sensor=5, spp=64))[..., :3]
+    ours = np.array(mi.render(scene, sensor=filmed(camera), spp=64))[..., :3]
     inside = sphere_depth(camera) > 0
     assert np.allclose(ours[inside].mean(0), theirs[inside].mean(0), rtol=0.05)
     assert np.allclose(ours[~inside].mean(0), theirs[~inside].mean(0), rtol=0.05)

@@ -78,7 +78,8 @@ def _step(scene, maps, optimizer, photograph, lighting, rng):
     with dr.suspend_grad():
         corners, point, filled = _seen(scene, maps, photograph.camera, pixel)
         dr.eval(corners, point, filled)
-        y = mi.Color3f(*(as_float(channel[some]) for channel in photograph.radiance.reshape(-1, 3).T))
+        seen = replace(photograph, pixels=photograph.pixels.reshape(-1, 4)[some])
+        y = mi.Color3f(*(as_float(channel) for channel in seen.radiance.T))
         gain = mi.Color3f(*(dr.opaque(mi.Float, float(g)) for g in photograph.exposure))
     base_color, metallic, normal, roughness, radiance = maps.means(corners, optimizer["texels"])
     lighting = lighting.seen_by(photograph.camera, _PIXELS)

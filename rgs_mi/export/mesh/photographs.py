@@ -13,7 +13,7 @@ _OPAQUE = 0.999  # least alpha of the object's pixels
 
 @dataclass(frozen=True)
 class Photograph:
-    """What one camera took: ``pixels`` [H, W, 4], those of a `View`, with a ``gain`` [3] (None: 1)."""
+    """What one camera took: ``pixels`` [H, W, 4], those of a `View`, or some of them [N, 4], with a ``gain`` [3] (None: 1)."""
 
     camera: Camera
     pixels: np.ndarray
@@ -21,14 +21,14 @@ class Photograph:
 
     @property
     def radiance(self) -> np.ndarray:
-        """Linear values in [0, 1], [H, W, 3] float32."""
+        """Linear values in [0, 1], [H, W, 3] or [N, 3] float32."""
         if self.pixels.dtype == np.uint8:
             return srgb_decode(self.pixels[..., :3].astype(np.float32) / 255)
         return np.clip(self.pixels[..., :3], 0, 1).astype(np.float32)
 
     @property
     def object(self) -> np.ndarray:
-        """Which pixels show nothing but the object, [H, W] bool."""
+        """Which pixels show nothing but the object, [H, W] or [N] bool."""
         alpha = self.pixels[..., 3]
         return alpha > _OPAQUE * (255 if alpha.dtype == np.uint8 else 1)
 
