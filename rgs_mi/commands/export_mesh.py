@@ -36,9 +36,9 @@ def export_mesh(
     as a GLB, turned by ``rotation`` [3, 3] and put where the capture has the world's ``origin`` [3], and as a scene of stock
     Mitsuba in the run's own world; return the paths of all files.
 
-    The mesh is what the run's training cameras see; where the photographs are gone, what the scene's sensors see. With
-    ``minutes`` textures and environment are refined that long against the training photographs, in the folder ``data`` (None:
-    where metrics.json says that they were).
+    The mesh is what the run's training cameras see, and where it is lit, base color and metallic are fitted to the photographs;
+    where these are gone, it is what the scene's sensors see. With ``minutes`` textures and environment are refined that long
+    against the training photographs, in the folder ``data`` (None: where metrics.json says that they were).
 
     Raises: UserError for a run without surfels or, with ``minutes``, without photographs or environment, and where a package is
     missing or a file can't be written.
@@ -56,9 +56,9 @@ def export_mesh(
     seen = [p.camera for p in photographs] or [Camera.from_sensor(sensor) for sensor in scene.sensors()]
     lit = lighting is not None and lighting.lit
     eta = surfels_of(scene, path).eta
-    splatted = lighting.as_splatted(surfels) if lit else surfels
+    splatted = surfels if lighting is None else lighting.as_splatted(surfels)
     result = build(splatted, seen, path, lit=lit, eta=eta, box=lighting and lighting.box, quiet=quiet)
-    if lit and photographs:
+    if lighting is not None and lit and photographs:
         own = fitted(result.textures, result.mesh, result.texels, result.radiance, photographs, lighting, quiet)
         result = replace(result, textures=own)
     environment = Environment.from_emitter(emitter).texels.numpy() if mapped else None
