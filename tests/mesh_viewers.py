@@ -13,6 +13,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from scipy import ndimage
 from scipy.spatial import KDTree
 
 import rgs_mi
@@ -104,8 +105,6 @@ def background(scene, camera):
 
 def _film(values, side):
     """[H, W, channels] of ``side`` × ``side`` values a pixel: what Mitsuba's Gaussian filter makes of them."""
-    from scipy import ndimage
-
     reach = 2 * side  # its radius is four standard deviations
     offset = (np.arange(-reach, reach) + 0.5) / side
     weight = np.maximum(np.exp(-2 * offset**2) - np.exp(-8), 0)

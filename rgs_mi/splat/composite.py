@@ -225,25 +225,27 @@ def composite(projected: Projected, features: "list[mi.Float]", isects: TileInte
     return dr.custom(Composite, projected.geometry + features + normal_derivatives, isects, layout)
 
 
-def median_depth(projected: Projected, isects: TileIntersections, size: tuple[int, int]) -> "mi.Float":
+def median_depth(projected: Projected, isects: TileIntersections, size: tuple[int, int]) -> "tuple[mi.Float, mi.Float]":
     """Return the depth at which half of each pixel's light is left, of width W · H, row-major: that of the first surfel behind
-    which the transmittance T of (2) is at most ½ (2DGS); 0 where there is none. Not differentiated."""
+    which the transmittance T of (2) is at most ½ (2DGS); 0 where there is none. And the pixel's coverage, 1 less the last T. Not
+    differentiated."""
     layout, stride = Layout(size, 0), padded(len(GEOMETRY))
 
-    def body(surfel, centers, T, depth):
+    def body(surfel, centers, T, state):
         r = fetch(gaussian, surfel, stride)
         for k, (x, y) in enumerate(centers):
             hit = Hit(r, x, y, layout.cutoffs)
             behind = T[k] * (1 - hit.alpha)
-            depth[k] = dr.select((T[k] > 0.5) & (behind <= 0.5), hit.t, depth[k])
+            state[k] = (dr.select((T[k] > 0.5) & (behind <= 0.5), hit.t, state[k][0]), 1 - behind)
             T[k] = behind
-        return T, depth
+        return T, state
 
     with dr.suspend_grad():
         gaussian = pack(projected.geometry)
-        depth = _walk(isects, layout, lambda pixels: [mi.Float(0)] * pixels, body)
-        dr.eval(depth)  # otherwise every scatter below would walk the lists again
-        image = dr.empty(mi.Float, size[0] * size[1])
-        for (row, inside), value in zip(_image_rows(layout), depth):
-            dr.scatter(image, value, row, inside)
-    return image
+        state = _walk(isects, layout, lambda pixels: [(mi.Float(0), mi.Float(0))] * pixels, body)
+        dr.eval(state)  # otherwise every scatter below would walk the lists again
+        depth, coverage = (dr.empty(mi.Float, size[0] * size[1]) for _ in range(2))
+        for (row, inside), values in zip(_image_rows(layout), state):
+            for image, value in zip((depth, coverage), values):
+                dr.scatter(image, value, row, inside)
+    return depth, coverage

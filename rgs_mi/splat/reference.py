@@ -67,12 +67,14 @@ def render_gbuffer_reference(surfels: "Surfels", camera: Camera, cutoffs: Cutoff
     return _maps(surfels, camera, cutoffs)[0]
 
 
-def median_depth_reference(surfels: "Surfels", camera: Camera, cutoffs: Cutoffs = Cutoffs()) -> np.ndarray:
-    """Return the depths [W · H] of `composite.median_depth`."""
+def median_depth_reference(
+    surfels: "Surfels", camera: Camera, cutoffs: Cutoffs = Cutoffs()
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the depths and coverages [W · H] of `composite.median_depth`."""
     _, alpha, z = _maps(surfels, camera, cutoffs)
     left = np.cumprod(1 - alpha.astype(np.float64), axis=1)
     first = (left <= 0.5).argmax(1)[:, None]
-    return np.where(left[:, -1] <= 0.5, np.take_along_axis(z, first, 1)[:, 0], 0)
+    return np.where(left[:, -1] <= 0.5, np.take_along_axis(z, first, 1)[:, 0], 0), 1 - left[:, -1]
 
 
 def _maps(surfels, camera, cutoffs):

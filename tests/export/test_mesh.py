@@ -31,7 +31,7 @@ from rgs_mi.export.mesh.build import build
 from rgs_mi.export.mesh.depth_maps import depth_map
 from rgs_mi.export.mesh.fit import _Maps, fitted
 from rgs_mi.export.mesh.photographs import Photograph
-from rgs_mi.export.mesh.surface import UVMesh, as_mitsuba, largest_parts, simplified, smoothed
+from rgs_mi.export.mesh.surface import UVMesh, as_mitsuba, coverage, largest_parts, simplified, smoothed
 from rgs_mi.export.mesh.textures import Texels, gltf_frames, mitsuba_frames, normal_map, vertex_tangents
 from rgs_mi.export.splats import fibonacci_sphere
 from rgs_mi.splat.reference import median_depth_reference
@@ -66,7 +66,9 @@ def sphere_depth(camera):
 def test_median_depth_equals_reference():
     surfels, cutoffs = sphere_surfels(200, seed=2), Cutoffs()
     camera = orbit_camera()
-    mine, reference = depth_map(surfels, camera).numpy(), median_depth_reference(surfels, camera, cutoffs)
+    (mine, coverage), (reference, covered) = depth_map(surfels, camera), median_depth_reference(surfels, camera, cutoffs)
+    mine = mine.numpy()
+    assert (abs(coverage.numpy() - covered) > 1e-3).mean() < 5e-3 and (covered > 0).mean() > 0.2
     assert (abs(mine - reference) > 1e-3).mean() < 5e-3 and (reference > 0).mean() > 0.2
 
 
@@ -161,7 +163,7 @@ def test_outlines_are_those_of_coverages(radius):
     """A sphere of another radius comes to that of coverages, wherever cameras see it, by a small part of a pixel, 0.046."""
     views = cameras(size=64)
     truth = icosphere(1.0)
-    coverages = [outlines._coverage(scene_of(truth), camera) for camera in views]
+    coverages = [coverage(scene_of(truth), camera, 2) for camera in views]
     found = outlines.aligned(icosphere(radius), views, coverages)
     error = np.linalg.norm(found.vertices, axis=1) - 1
     assert abs(error.mean()) < 0.003 and abs(error).max() < 0.012

@@ -12,7 +12,7 @@ from ...core.errors import UserError
 from ...core.progress import Progress
 from ...surfels.surfels import Surfels
 from . import tsdf
-from .depth_maps import coverage_map, depth_map
+from .depth_maps import depth_map
 from .lookup import look_up
 from .outlines import aligned
 from .surface import UVMesh, largest_parts, simplified, smoothed, unwrapped
@@ -49,9 +49,11 @@ def build(
     Raises: UserError where cameras see nothing, or a package is missing.
     """
     with Progress(None, quiet, "meshing") as progress:
-        depths = []
+        depths, coverages = [], []
         for k, camera in enumerate(cameras):
-            depths.append(depth_map(surfels, camera))
+            depth, coverage = depth_map(surfels, camera)
+            depths.append(depth)
+            coverages.append(coverage.numpy().reshape(camera.size[::-1]))
             progress.update(0.2 * (k + 1) / len(cameras))
         volume = tsdf.fuse(cameras, depths, box)
         progress.update(0.3)
@@ -66,14 +68,16 @@ def build(
         dense = smoothed(dense, _normals(dense, look, 0.4, 0.6))
         mesh = simplified(dense, min(_MOST_FACES, int(_FACES * len(dense.faces))))
         progress.update(0.62)
-        mesh = aligned(mesh, cameras, [coverage_map(surfels, camera) for camera in cameras])
+        mesh = aligned(mesh, cameras, coverages)
         progress.update(0.65)
         mesh = replace(mesh, normals=_normals(mesh, look, 0.65, 0.7))
         uv = unwrapped(mesh, _TEXEL * volume.voxel)
         progress.update(0.8)
         texels = Texels.of(uv)
         seen = look(texels.points, texels.normals, 0.8, 1.0)
-    return TexturedMesh(uv, texels, textures(uv, texels, seen, lit, eta), texels.filled(seen.radiance, seen.known))
+    return TexturedMesh(
+        uv, texels, textures(uv, texels, seen, lit, eta), texels.image(seen.radiance, texels.nearest(seen.known))
+    )
 
 
 def _normals(mesh, look, first, last):

@@ -44,9 +44,9 @@ def fitted(
     reached."""
     scene = mi.load_dict({"type": "scene", "mesh": as_mitsuba(mesh)})
     lighting = replace(lighting, shader=None)  # which no other program has
-    at = lambda image: image.reshape(-1, image.shape[-1])[texels.index]
-    learned = np.concatenate([at(textures.base_color), at(textures.metallic)], 1)
-    known = np.concatenate([at(textures.normal), at(textures.roughness), at(visibility), np.zeros((len(learned), 1))], 1)
+    learned = np.concatenate([texels.at(image) for image in (textures.base_color, textures.metallic)], 1)
+    known = [texels.at(image) for image in (textures.normal, textures.roughness, visibility)]
+    known = np.concatenate([*known, np.zeros((len(learned), 1))], 1)
     maps = _Maps(mi.UInt32(texels.near.astype(np.uint32)), mesh.size, as_float(known))
     optimizer = mi.ad.Adam(lr=_RATE)
     optimizer["texels"] = as_float(learned)
@@ -60,12 +60,7 @@ def fitted(
             _step(scene, maps, optimizer, photographs[order.pop()], lighting, rng)
             progress.update((step + 1) / _STEPS)
     found = optimizer["texels"].numpy().reshape(-1, _CHANNELS)
-    everywhere = np.ones(len(found), bool)
-    return replace(
-        textures,
-        base_color=texels.filled(found[:, :3], everywhere),
-        metallic=texels.filled(found[:, 3:], everywhere),
-    )
+    return replace(textures, base_color=texels.image(found[:, :3]), metallic=texels.image(found[:, 3:]))
 
 
 def _step(scene, maps, optimizer, photograph, lighting, rng):

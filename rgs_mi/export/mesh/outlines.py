@@ -13,14 +13,13 @@ cameras say of vertices i and over edges ij.
 
 from collections.abc import Sequence
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy import ndimage, sparse
 
-from ...core.camera import Camera, opaque, pixel_directions
+from ...core.camera import Camera
 from ...targets.meshes import Mesh, unit
-from .surface import as_mitsuba
+from .surface import as_mitsuba, coverage
 
 _REACH, _STEP = 3.0, 0.5  # pixels on either side of an outline that (23) is an integral over, and between its samples
 _CLEAR = 0.1  # coverage up to which a pixel is empty, and short of which it is full
@@ -43,8 +42,13 @@ def _offsets(mesh, cameras, coverages):
     ends, faces = _edges(mesh.faces)
     weight, total = np.zeros(count), np.zeros(count)
     scene = mi.load_dict({"type": "scene", "mesh": as_mitsuba(mesh)})
-    for camera, coverage in zip(cameras, coverages):
-        edges, offset = _measured(mesh, ends, faces, scene, camera, coverage)
+    a, b, c = mesh.vertices.astype(float)[mesh.faces].transpose(1, 0, 2)
+    outward = np.cross(b - a, c - a)
+    for camera, covered in zip(cameras, coverages):
+        facing = (outward * (a - camera.origin)).sum(1) < 0
+        outline = np.flatnonzero(facing[faces[:, 0]] != facing[faces[:, 1]])
+        clear, offset = _measured(mesh, ends[outline], scene, camera, covered)
+        edges = outline[clear]
         for side in (0, 1):
             weight += np.bincount(ends[edges, side], minlength=count)
             total += np.bincount(ends[edges, side], offset, count)
@@ -63,33 +67,21 @@ def _edges(faces):
     return ends[one], np.stack([one, other], 1) // 3
 
 
-def _measured(mesh, ends, faces, scene, camera, coverage):
-    """(indices of edges, their offsets in world units): d z / f of (23) at the middle of each edge that is an outline."""
-    a, b, c = mesh.vertices.astype(float)[mesh.faces].transpose(1, 0, 2)
-    facing = (np.cross(b - a, c - a) * (a - camera.origin)).sum(1) < 0
-    edges = np.flatnonzero(facing[faces[:, 0]] != facing[faces[:, 1]])
-    point = mesh.vertices[ends[edges]].astype(float).mean(1)
-    normal = unit(mesh.normals[ends[edges]].astype(float).mean(1))
+def _measured(mesh, ends, scene, camera, covered):
+    """(whether an outline shows at the middle of each edge of these ``ends`` [E, 2], which lie between front and back; where it
+    does, d z / f of (23))."""
+    point = mesh.vertices[ends].astype(float).mean(1)
+    normal = unit(mesh.normals[ends].astype(float).mean(1))
     step = 1e-4 * np.linalg.norm(point - camera.origin, axis=1, keepdims=True)
     (pixel, z), (beside, _) = camera.project(point), camera.project(point + step * normal)
     across = unit(beside - pixel)
-    own = _coverage(scene, camera)
+    own = coverage(scene, camera, _SIDE)
     along = np.arange(-_REACH, _REACH + _STEP / 2, _STEP)
     at = pixel[:, None] + along[:, None] * across[:, None] - 0.5
     sample = lambda image: ndimage.map_coordinates(image, [at[..., 1], at[..., 0]], order=1, mode="nearest")
-    alpha, beta = sample(coverage), sample(own)
-    ok = np.ones(len(edges), bool)
+    alpha, beta = sample(covered), sample(own)
+    clear = ((at > 0) & (at < np.array(camera.size) - 1)).all((1, 2))
     for profile in (alpha, beta):
-        ok &= (profile[:, 0] > 1 - _CLEAR) & (profile[:, -1] < _CLEAR)
-    size = np.array(camera.size)
-    ok &= ((at > 0) & (at < size - 1)).all((1, 2))
+        clear &= (profile[:, 0] > 1 - _CLEAR) & (profile[:, -1] < _CLEAR)
     offset = _STEP * (alpha - beta).sum(1) * z / max(camera.focal)
-    return edges[ok], offset[ok]
-
-
-def _coverage(scene, camera):
-    """[H, W] how much of each pixel the mesh fills."""
-    (width, height), (fine, side) = camera.size, camera.subdivided(_SIDE**2)
-    index = dr.arange(mi.UInt32, width * height * side**2)
-    hit = scene.ray_test(mi.Ray3f(opaque(camera).origin, pixel_directions(fine, index)))
-    return hit.numpy().reshape(height, side, width, side).mean((1, 3), dtype=np.float32)
+    return clear, offset[clear]

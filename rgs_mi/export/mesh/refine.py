@@ -24,12 +24,11 @@ import numpy as np
 from skimage.transform import downscale_local_mean
 
 from ...core.arrays import as_float, as_tensor
-from ...core.camera import opaque, pixel_directions
 from ...core.interrupt import GracefulInterrupt
 from ...core.progress import Progress
 from .photographs import SATURATED, Photograph
 from .stock_scene import LIGHT
-from .surface import UVMesh
+from .surface import UVMesh, coverage
 from .textures import Texels
 
 _DEPTH, _SPP, _SPP_GRADIENT = 4, 8, 2
@@ -154,7 +153,7 @@ def _target(scene, photograph):
     width, height = (n // side for n in photograph.camera.size)
     camera = photograph.camera.cropped(0, 0, width * side, height * side).resized(width, height)
     smaller = lambda values: downscale_local_mean(values[: height * side, : width * side], (side, side, 1))
-    filled = (smaller(photograph.object[..., None]) == 1) & _filled(scene, camera)[..., None]
+    filled = (smaller(photograph.object[..., None]) == 1) & (coverage(scene, camera, _GRID)[..., None] == 1)
     return _Target(
         mi.load_dict(camera.to_sensor_dict()),
         as_tensor(smaller(photograph.radiance)),
@@ -162,14 +161,6 @@ def _target(scene, photograph):
         as_tensor(np.reshape(photograph.exposure, (1, 1, 3))),
         float(filled.mean()),
     )
-
-
-def _filled(scene, camera):
-    """[H, W] which pixels of ``camera`` show nothing but the mesh."""
-    (width, height), (fine, side) = camera.size, camera.subdivided(_GRID**2)
-    index = dr.arange(mi.UInt32, width * height * side * side)
-    ray = mi.Ray3f(opaque(camera).origin, pixel_directions(fine, index))
-    return scene.ray_test(ray).numpy().reshape(height, side, width, side).all((1, 3))
 
 
 def _step(scene, params, integrator, target, seed):

@@ -5,11 +5,13 @@ import importlib
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy import sparse
 
 from ...core.arrays import as_float
+from ...core.camera import Camera, opaque, pixel_directions
 from ...core.errors import UserError
 from ...targets.meshes import Mesh, weld
 
@@ -87,6 +89,14 @@ def as_mitsuba(mesh: "Mesh | UVMesh") -> "mi.Mesh":
     params["faces"] = mi.UInt32(mesh.faces.ravel())
     params.update()
     return own
+
+
+def coverage(scene: "mi.Scene", camera: Camera, side: int) -> np.ndarray:
+    """Return how much of each pixel of ``camera`` the shapes of a ``scene`` fill, [H, W] float32, by ``side`` × ``side`` rays."""
+    (width, height), (fine, _) = camera.size, camera.subdivided(side**2)
+    index = dr.arange(mi.UInt32, width * height * side**2)
+    hit = scene.ray_test(mi.Ray3f(opaque(camera).origin, pixel_directions(fine, index)))
+    return hit.numpy().reshape(height, side, width, side).mean((1, 3), dtype=np.float32)
 
 
 # ---- On a plane ----

@@ -73,34 +73,40 @@ class Texels:
         return self.nearest(np.ones(len(self.index), bool))
 
     def nearest(self, among: np.ndarray) -> np.ndarray:
-        """Return `near` of those alone where ``among`` [T] holds, anywhere at least."""
+        """Return `near` of those alone where ``among`` [T] holds, or of all where it holds nowhere."""
+        if not among.any():
+            return self.near
         number = np.full(self.size[0] * self.size[1], -1)
         number[self.index] = np.where(among, np.arange(len(among)), -1)
         number = number.reshape(self.size[::-1])
         row, column = np.asarray(ndimage.distance_transform_edt(number < 0, return_distances=False, return_indices=True))
         return number[row, column].ravel()
 
-    def filled(self, values: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """Return the texture [H, W, channels] of ``values`` [T, channels]; where they are not ``known`` [T] it is like the
-        nearest that are."""
-        near = self.nearest(known) if known.any() else self.near
-        return values[near].reshape(*self.size[::-1], -1).astype(np.float32)
+    def image(self, values: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
+        """Return the texture [H, W, channels] of ``values`` [T, channels], each of its texels like that of `near`, or of another
+        ``near`` [H · W]."""
+        return values[self.near if near is None else near].reshape(*self.size[::-1], -1).astype(np.float32)
+
+    def at(self, image: np.ndarray) -> np.ndarray:
+        """Return the values [T, channels] of an ``image`` [H, W, channels] at these texels."""
+        return image.reshape(-1, image.shape[-1])[self.index]
 
 
 def textures(mesh: UVMesh, texels: Texels, seen: Seen, lit: bool, eta: float) -> Textures:
     """Return the `Textures` of a ``mesh`` from what was ``seen`` at its ``texels``; ``lit`` says whether surfels have no radiance
     of their own, and ``eta`` is their index of refraction. What no camera sees is like the nearest that one does."""
-    filled = lambda values: texels.filled(values, seen.known)
+    near = texels.nearest(seen.known)
+    image = lambda values: texels.image(values, near)
     base_color, metallic = np.clip(seen.base_color, 0, 1), np.clip(seen.metallic, 0, 1)
     if not lit:
         base_color, metallic = metallic * base_color + (1 - metallic) * normal_reflectance(eta), np.ones_like(metallic)
     normal = np.where(seen.known[:, None], seen.normal, texels.normals)
     return Textures(
-        filled(base_color),
-        filled(np.clip(seen.roughness, 0, 1)),
-        filled(metallic),
-        normal[texels.near].reshape(*mesh.size[::-1], 3).astype(np.float32),
-        None if lit else filled(seen.radiance),
+        image(base_color),
+        image(np.clip(seen.roughness, 0, 1)),
+        image(metallic),
+        texels.image(normal),
+        None if lit else image(seen.radiance),
     )
 
 
@@ -110,8 +116,8 @@ def textures(mesh: UVMesh, texels: Texels, seen: Seen, lit: bool, eta: float) ->
 def normal_map(mesh: UVMesh, texels: Texels, normal: np.ndarray, frames: Callable[..., np.ndarray]) -> np.ndarray:
     """Return the ``normal`` [H, W, 3] of a texture, world space, in the ``frames`` of its texels (`mitsuba_frames` or
     `gltf_frames`), in [0, 1] as images have it: n / 2 + ½."""
-    local = unit(np.einsum("tij,tj->ti", frames(mesh, texels), normal.reshape(-1, 3)[texels.index]))
-    return (local[texels.near].reshape(*mesh.size[::-1], 3) / 2 + 0.5).astype(np.float32)
+    local = unit(np.einsum("tij,tj->ti", frames(mesh, texels), texels.at(normal)))
+    return texels.image(local / 2 + 0.5)
 
 
 def mitsuba_frames(mesh: UVMesh, texels: Texels) -> np.ndarray:
