@@ -1,5 +1,7 @@
 """Between linear light and display values: the sRGB curve, and images over a background."""
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
@@ -8,6 +10,12 @@ def srgb_encode(linear: np.ndarray) -> np.ndarray:
     """Take linear light, of any shape, to display values by the piecewise curve of IEC 61966-2-1."""
     linear = np.asarray(linear)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def srgb(x: "mi.Color3f") -> "mi.Color3f":
+    """Return `srgb_encode` of Dr.Jit's ``x``, differentiable: continued above one; negative values count as zero."""
+    x = dr.maximum(x, 0)
+    return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * dr.power(dr.maximum(x, 0.0031308), 1 / 2.4) - 0.055)
 
 
 def srgb_decode(encoded: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..core.arrays import as_float
 from ..core.camera import Camera, pixel_rays
+from ..core.color import srgb
 from ..shading.deferred import COVERED
 from ..splat.gbuffer import GBuffer, Maps
 from ..surfels.surfels import columns_of
@@ -16,12 +17,6 @@ _C1, _C2 = 0.01**2, 0.03**2
 _SLOPE = 4.0  # change of log radiance per radian up to which it counts by its square
 _APART, _BEND = 0.015, 0.015  # of `minimum_variation`: part of the image's width; radians
 _FLAT = 1e-6  # standard deviation of a depth map, in units of its depth, up to which it is constant
-
-
-def srgb(x: "mi.Color3f") -> "mi.Color3f":
-    """Take linear light to display values by the sRGB curve, continued above one; negative values count as zero."""
-    x = dr.maximum(x, 0)
-    return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * dr.power(dr.maximum(x, 0.0031308), 1 / 2.4) - 0.055)
 
 
 def completed(color: "mi.Color3f", alpha: "mi.Float", left: float) -> "tuple[mi.Color3f, mi.Float]":

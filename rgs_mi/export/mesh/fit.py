@@ -15,9 +15,9 @@ import numpy as np
 
 from ...core.arrays import as_float
 from ...core.camera import opaque, pixel_directions
+from ...core.color import srgb
 from ...core.interrupt import GracefulInterrupt
 from ...core.progress import Progress
-from ...fit.losses import srgb
 from ...shading.lighting import Lighting
 from ...shading.surface import Surface
 from .photographs import SATURATED, Photograph
