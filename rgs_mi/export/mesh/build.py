@@ -19,7 +19,7 @@ from .surface import UVMesh, largest_parts, simplified, smoothed, unwrapped
 from .textures import Texels, Textures, textures
 
 _FACES, _MOST_FACES = 1 / 16, 60_000  # of the mesh, over those of the surface voxel by voxel; of any
-_TEXEL = 0.7  # voxels
+_TEXEL = 0.7  # pixels
 _TOLERANCE = 2.0  # voxels between a camera's depth map and what it sees
 
 
@@ -71,7 +71,7 @@ def build(
         mesh = aligned(mesh, cameras, coverages)
         progress.update(0.65)
         mesh = replace(mesh, normals=_normals(mesh, look, 0.65, 0.7))
-        uv = unwrapped(mesh, _TEXEL * volume.voxel)
+        uv = unwrapped(mesh, _TEXEL * volume.pixel)
         progress.update(0.8)
         texels = Texels.of(uv)
         seen = look(texels.points, texels.normals, 0.8, 1.0)

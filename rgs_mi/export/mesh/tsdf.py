@@ -11,7 +11,7 @@ where the mean of s is zero, between voxels that some view has told of.
 Voxels have about the size of a pixel on the surface. Only those near what some view sees are there, in blocks of 8³: of the
 helmet at 400 × 400 pixels these are 13 000 blocks, 6.7 million voxels of a box of 43 million. Which blocks there are, a mask of
 the whole box says, one in 512 of its voxels, so that no hash of blocks is needed; marching cubes fill some layers of blocks at a
-time. Four times as many pixels have four times as many voxels, and fit as well.
+time. Photographs of more pixels have more voxels, up to as many as a mesh of 60 000 triangles can show.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ from ...targets.meshes import Mesh, weld
 
 BLOCK = 8  # voxels along a block's edge
 TRUNCATION = 5.0  # τ, voxels
-_MOST_BLOCKS, _MOST_VOXELS = 2**25, 2**26  # in the whole box; in those that are there
+_MOST_BLOCKS, _MOST_VOXELS = 2**25, 2**23  # in the whole box; in those that are there: more than its mesh can show
 _COARSER = 1.25  # voxels grow by that until both hold
 _SLAB = 8  # blocks whose surface is extracted at a time
 
@@ -39,6 +39,7 @@ class Volume:
 
     origin  [3] world-space position of voxel (0, 0, 0)
     voxel   distance between voxels, world units
+    pixel   median size of a pixel on the surface, world units
     shape   [3] blocks of the whole box
     blocks  [B, 3] which of these are there
     distance, weight  [B, 8, 8, 8] float32: the mean of s of (16), 1 where nothing is known; the sum of w
@@ -46,6 +47,7 @@ class Volume:
 
     origin: np.ndarray
     voxel: float
+    pixel: float
     shape: np.ndarray
     blocks: np.ndarray
     distance: np.ndarray
@@ -58,8 +60,8 @@ def fuse(
     """Return the `Volume` of what ``cameras`` see at ``depths`` (of width W · H each, row-major, camera-space z; 0 where they
     see nothing), within the ``box`` (None: all of it). None where no camera sees anything.
 
-    ``voxel``: world units (None: the median size of a pixel on the surface). Where there is too much surface for memory voxels
-    are larger.
+    ``voxel``: world units (None: the median size of a pixel on the surface). Where there is more surface than `_MOST_VOXELS`
+    show voxels are larger.
     """
     with dr.suspend_grad():
         lower, upper, footprint = _extent(cameras, depths, box)
@@ -74,7 +76,7 @@ def fuse(
                 if len(blocks) * BLOCK**3 <= _MOST_VOXELS:
                     break
             voxel *= _COARSER
-        return Volume(origin, voxel, shape, blocks, *_integrated(cameras, depths, origin, voxel, blocks))
+        return Volume(origin, voxel, footprint, shape, blocks, *_integrated(cameras, depths, origin, voxel, blocks))
 
 
 def _extent(cameras, depths, box):
