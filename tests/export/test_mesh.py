@@ -133,6 +133,7 @@ def test_voxels_grow_where_memory_ends(sphere, monkeypatch):
     views, depths, volume = sphere
     monkeypatch.setattr(tsdf, "_MOST_VOXELS", volume.distance.size // 4)
     coarse = tsdf.fuse(views, [as_float(d) for d in depths], voxel=VOXEL)
+    assert coarse.pixel == volume.pixel  # of which texels are
     assert coarse.voxel > 1.5 * VOXEL and coarse.distance.size <= volume.distance.size // 4
 
 

@@ -75,9 +75,8 @@ def build(
         progress.update(0.8)
         texels = Texels.of(uv)
         seen = look(texels.points, texels.normals, 0.8, 1.0)
-    return TexturedMesh(
-        uv, texels, textures(uv, texels, seen, lit, eta), texels.image(seen.radiance, texels.nearest(seen.known))
-    )
+    near = texels.nearest(seen.known)
+    return TexturedMesh(uv, texels, textures(texels, seen, near, lit, eta), texels.image(seen.radiance, near))
 
 
 def _normals(mesh, look, first, last):

@@ -92,10 +92,9 @@ class Texels:
         return image.reshape(-1, image.shape[-1])[self.index]
 
 
-def textures(mesh: UVMesh, texels: Texels, seen: Seen, lit: bool, eta: float) -> Textures:
-    """Return the `Textures` of a ``mesh`` from what was ``seen`` at its ``texels``; ``lit`` says whether surfels have no radiance
-    of their own, and ``eta`` is their index of refraction. What no camera sees is like the nearest that one does."""
-    near = texels.nearest(seen.known)
+def textures(texels: Texels, seen: Seen, near: np.ndarray, lit: bool, eta: float) -> Textures:
+    """Return the `Textures` of a mesh from what was ``seen`` at its ``texels``; ``lit`` says whether surfels have no radiance of
+    their own, and ``eta`` is their index of refraction. What no camera sees is like the texel that ``near`` [H · W] names."""
     image = lambda values: texels.image(values, near)
     base_color, metallic = np.clip(seen.base_color, 0, 1), np.clip(seen.metallic, 0, 1)
     if not lit:

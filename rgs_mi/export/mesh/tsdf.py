@@ -64,10 +64,10 @@ def fuse(
     show voxels are larger.
     """
     with dr.suspend_grad():
-        lower, upper, footprint = _extent(cameras, depths, box)
-        if not np.isfinite(footprint):
+        lower, upper, pixel = _extent(cameras, depths, box)
+        if not np.isfinite(pixel):
             return None
-        voxel = voxel or footprint
+        voxel = voxel or pixel
         while True:
             origin = lower - 2 * TRUNCATION * voxel
             shape = np.ceil((upper - lower + 4 * TRUNCATION * voxel) / (BLOCK * voxel)).astype(int)
@@ -76,7 +76,7 @@ def fuse(
                 if len(blocks) * BLOCK**3 <= _MOST_VOXELS:
                     break
             voxel *= _COARSER
-        return Volume(origin, voxel, footprint, shape, blocks, *_integrated(cameras, depths, origin, voxel, blocks))
+        return Volume(origin, voxel, pixel, shape, blocks, *_integrated(cameras, depths, origin, voxel, blocks))
 
 
 def _extent(cameras, depths, box):
