@@ -122,8 +122,8 @@ class Photographs:
             images.append(np.where(near, display(opaque, 0.0), np.float32(self.background)))
         images = shrink(np.concatenate(images, 2), block)
         prior = images[..., :0] if self.priors is None else cut(resize(self.priors[i].values, *size[::-1]), 1)[..., None]
-        # Half precision keeps colours; of depths it would make steps.
-        return [np.ascontiguousarray(p.transpose(2, 0, 1), kind) for p, kind in ((images, np.float16), (prior, np.float32))]
+        # Half precision keeps colours; of depths it would make steps. Copies: views, of no prior too, would keep all of `images`.
+        return [np.array(p.transpose(2, 0, 1), kind, order="C") for p, kind in ((images, np.float16), (prior, np.float32))]
 
     def _size(self, view):
         """(width, height) of a whole photograph of this level."""

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 
 KINDS = ("none", "visibility", "one_bounce")
 _RAYS, _TURNS = 32, 8  # from each surfel, of (9); places about a turntable in which these see the light
+_MOST_RAYS = 1 << 21  # at a time: of 300 000 surfels all together would take 800 MB
 _BLUR = 0.5  # the roughness as whose lobe sees it the environment is taken there: few rays then see small lights, too
 
 
@@ -89,15 +90,17 @@ class Indirect:
 
     def _irradiance_visibility(self, normal, lighting, seed):
         n, coming, radiance = len(self.surfels), mi.Color3f(0), mi.Color3f(0)
-        turns = 1 if lighting.turntable is None else _TURNS
-        each = _RAYS // turns  # rays that see the light in one place
+        rounds = 1 if lighting.turntable is None else _TURNS
+        while n * _RAYS > rounds * _MOST_RAYS and rounds < _RAYS:
+            rounds *= 2
+        each = _RAYS // rounds  # rays that see the light in one place
         index = dr.arange(mi.UInt32, n * each)
         surfel = index // each
         at = lambda v: dr.gather(type(v), v, surfel)
         total = lambda color: mi.Color3f(*(dr.block_sum(c, each) for c in color))
         normal, point = at(normal), at(self.surfels.column(mi.Vector3f, "centers"))
-        for k in range(turns):
-            light = lighting.turned(dr.opaque(mi.Float, 2 * np.pi * k / turns))
+        for k in range(rounds):
+            light = lighting.turned(dr.opaque(mi.Float, 2 * np.pi * k / rounds))
             sample = index % each + dr.opaque(mi.UInt32, k * each)
             local = mi.warp.square_to_cosine_hemisphere(points(n, seed, surfel, sample)[0])
             direction = mi.Frame3f(normal).to_world(local)

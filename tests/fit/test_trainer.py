@@ -61,6 +61,13 @@ def test_priors_are_cropped_like_photographs(dataset, downscale):
     assert Photographs(dataset.train, downscale, 1.0).tile(2).prior is None
 
 
+def test_photographs_keep_no_more_than_they_count(dataset):
+    photographs = Photographs(dataset.train, 1, 1.0)
+    photographs.tile(0)
+    (kept,) = photographs._kept.values()
+    assert kept[0].dtype == np.float16 and all(planes.base is None for planes in kept)
+
+
 @pytest.mark.parametrize("downscale, rim", [(1, None), (1, 2), (2, None)])
 def test_photographs_that_are_not_kept_are_the_same(dataset, monkeypatch, downscale, rim):
     values = [np.where(v.pixels[..., 3] > 127, v.pixels[..., 3] / 255, np.nan).astype(np.float32) for v in dataset.train]

@@ -10,7 +10,7 @@ import pytest
 from scipy import ndimage
 
 from rgs_mi.core.camera import Camera
-from rgs_mi.shading import deferred
+from rgs_mi.shading import deferred, indirect
 from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.indirect import Indirect
 from rgs_mi.shading.lighting import Lighting
@@ -288,6 +288,16 @@ def test_share_of_diffuse_light_under_a_disc(two_sided):
     # all of it where what shows from behind is hidden by nothing
     share = 1 if two_sided else 1 - radius**2 / (radius**2 + height**2)
     assert irradiance_visibility[0] == pytest.approx(share, abs=1e-6 if two_sided else 0.01)
+
+
+def test_hidden_light_of_many_surfels_is_found_in_rounds(monkeypatch):
+    surfels = corner()
+    light = lighting(surfels, "visibility", lit=True)
+    of = lambda: light.with_irradiance_visibility(3).indirect.irradiance_visibility.numpy()
+    together = of()
+    monkeypatch.setattr(indirect, "_MOST_RAYS", 5 * len(surfels))  # of 32 for each
+    assert together.min() < 0.7 < together.mean()
+    np.testing.assert_allclose(of(), together, atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", ["visibility", "one_bounce"])
