@@ -186,6 +186,7 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
     else:
         extent = box.radius
         points = _with_surroundings(points, dataset, settings)
+    points = points.in_places()
 
     middle = points.positions.mean(0) if box is None else box.center
 

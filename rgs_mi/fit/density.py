@@ -173,7 +173,8 @@ def densify(
     # Two surfels on one spot cover as much as one did: 1 − (1 − o')² = o.
     twins = np.concatenate([np.flatnonzero(np.isin(stay, clone)), np.arange(len(stay), len(stay) + len(clone))])
     changes["logit_opacities"][twins, 0] = logit(1 - np.sqrt(1 - opacity[index[twins]]))
-    model.select(index, changes)
+    order = np.argsort(index, kind="stable")  # beside their parents: what is near is to lie together in memory, too
+    model.select(index[order], {name: value[order] for name, value in changes.items()})
 
 
 def _tangents(model):

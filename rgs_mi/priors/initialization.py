@@ -39,6 +39,14 @@ class Points(NamedTuple):
         look = (np.concatenate(pair) for pair in zip(self.appearance, others.appearance))
         return Points(positions, normals, spacing, Appearance._make(look))
 
+    def in_places(self) -> "Points":
+        """Return the same points in an order in which those that follow one another are near one another: what a pixel sees then
+        lies together in memory, too."""
+        order = spatial.KDTree(self.positions).indices
+        normals = None if self.normals is None else self.normals[order]
+        look = Appearance._make(values[order] for values in self.appearance)
+        return Points(self.positions[order], normals, self.spacing[order], look)
+
 
 def initial_points(
     dataset: Dataset, count: int, seed: int = 0, on_hull: bool = True, compare: bool = True, quiet: bool = True

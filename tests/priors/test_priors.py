@@ -13,6 +13,8 @@ from rgs_mi.core.errors import UserError
 from rgs_mi.datasets.images import resize
 from rgs_mi.datasets.types import DepthPrior, View
 from rgs_mi.priors import NAMES, depth_priors, hull, maps, vggt
+from rgs_mi.priors.initialization import Points
+from rgs_mi.priors.photometric_variation import Appearance
 
 SIZE = (48, 40)  # width, height
 
@@ -544,3 +546,17 @@ def test_vggt_cache_needs_neither_torch_nor_cameras(network, tmp_path, monkeypat
         assert b.inverse is False
     fails("needs packages", "vggt", views, cache=tmp_path, background=0.5)
     fails("needs packages", "vggt", views, cache=tmp_path, weights="someone/else")
+
+
+@pytest.mark.parametrize("on_surface", [True, False])
+def test_points_in_places_are_the_same_and_near_those_before_them(on_surface):
+    at = np.random.default_rng(0).uniform(-1, 1, (2000, 3)).astype(np.float32)
+    points = Points(at, 2 * at if on_surface else None, at[:, 0], Appearance(at + 1, at + 2, at[:, 1]))
+    found = points.in_places()
+    np.testing.assert_array_equal(np.sort(found.positions, axis=0), np.sort(at, axis=0))
+    moved = found.positions
+    for values, expected in zip((found.spacing, *found.appearance), (moved[:, 0], moved + 1, moved + 2, moved[:, 1])):
+        np.testing.assert_array_equal(values, expected)
+    assert (found.normals == 2 * moved).all() if on_surface else found.normals is None
+    step = lambda p: np.linalg.norm(np.diff(p, axis=0), axis=1).mean()
+    assert step(moved) < 0.2 * step(at)
