@@ -149,32 +149,30 @@ def densify(
         need = need * np.where(guided, 2, 1)
     hot = np.flatnonzero(keep & (need > 1))
     room = max(0, budget - int(keep.sum()))
-    hot = np.sort(hot[np.argsort(-need[hot], kind="stable")][:room])
-    split, clone = hot[large[hot]], hot[~large[hot]]
+    hot = hot[np.argsort(-need[hot], kind="stable")][:room]
 
-    stay = np.flatnonzero(keep)
-    index = np.concatenate([stay, clone, split])
+    # Those that grow are there twice, one beside the other: what is near is to lie together in memory, too
+    index = np.sort(np.concatenate([np.flatnonzero(keep), hot]))
+    grown, fresh = np.isin(index, hot), np.append(False, index[1:] == index[:-1])
     changed = "centers", "log_scales", "logit_opacities", "delta_normal", "curvature"
-    changes = {name: model.numpy(name)[index] for name in changed}
-    changes["fresh"] = np.arange(len(index)) >= len(stay)
+    changes = {name: model.numpy(name)[index] for name in changed} | {"fresh": fresh}
 
     # Both halves of a split are drawn from the parent; they lie in its plane, with the normals it has where they are.
     # Each surfel has its own draw: one that is split in this run and not in the next changes nothing for the others.
-    parents = np.isin(stay, split)
-    halves = np.concatenate([np.flatnonzero(parents), np.arange(len(stay) + len(clone), len(index))])
-    (t_u, t_v), normal_derivatives = ([v.numpy().T[index[halves]] for v in pair] for pair in _tangents(model))
+    halves = np.flatnonzero(grown & large[index])
+    parents = index[halves]
+    (t_u, t_v), normal_derivatives = ([v.numpy().T[parents] for v in pair] for pair in _tangents(model))
     draws = rng.normal(size=(2, len(model), 2)).astype(np.float32)
-    u, v = np.concatenate([draws[0, stay[parents]], draws[1, split]]).T[..., None]
-    s_u, s_v = scales[index[halves], :, None].transpose(1, 0, 2)
+    u, v = draws[fresh[halves].astype(int), parents].T[..., None]
+    s_u, s_v = scales[parents, :, None].transpose(1, 0, 2)
     changes["centers"][halves] += u * s_u * t_u + v * s_v * t_v
     changes["delta_normal"][halves] += u * normal_derivatives[0] + v * normal_derivatives[1]
     changes["curvature"][halves] /= _SPLIT_SCALE
     changes["log_scales"][halves] -= np.log(_SPLIT_SCALE)
     # Two surfels on one spot cover as much as one did: 1 − (1 − o')² = o.
-    twins = np.concatenate([np.flatnonzero(np.isin(stay, clone)), np.arange(len(stay), len(stay) + len(clone))])
+    twins = np.flatnonzero(grown & ~large[index])
     changes["logit_opacities"][twins, 0] = logit(1 - np.sqrt(1 - opacity[index[twins]]))
-    order = np.argsort(index, kind="stable")  # beside their parents: what is near is to lie together in memory, too
-    model.select(index[order], {name: value[order] for name, value in changes.items()})
+    model.select(index, changes)
 
 
 def _tangents(model):
