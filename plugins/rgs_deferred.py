@@ -73,8 +73,8 @@ coverage: divide by that of type ``alpha`` for means.
 The scene needs an ``envmap`` or ``constant`` emitter and a ``perspective`` sensor; other shapes and emitters are
 ignored. ``mi.render`` differentiates, in both modes, with respect to all fields of the surfels and the radiance of the
 environment, not to the sensor nor the shader's weights. ``spp``, rounded up to a square, is the number of points of a
-regular grid in each pixel, over which the pixel is averaged whatever the film's reconstruction filter. Nothing is random
-but ``monte_carlo``, whose samples ``seed`` decides.
+regular grid in each pixel, which the film's reconstruction filter weighs. Nothing is random but ``monte_carlo``, whose samples
+``seed`` decides.
 """
 
 from dataclasses import replace
@@ -85,6 +85,7 @@ import mitsuba as mi
 
 from rgs_mi.core.camera import Camera, pixel_directions
 from rgs_mi.core.errors import UserError
+from rgs_mi.core.film import Film
 from rgs_mi.shading import deferred, indirect
 from rgs_mi.shading.environment import Environment, FilteredEnvironment
 from rgs_mi.shading.lighting import Lighting, Shading, lighting_of
@@ -154,7 +155,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         film.prepare(self.aov_names())
         spp = spp or chosen.sampler().sample_count()
         has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-        channels = self._channels(scene, Camera.from_sensor(chosen), spp, has_alpha, seed)
+        channels = self._channels(scene, Camera.from_sensor(chosen), Film.of(film.rfilter(), spp), has_alpha, seed)
         film.put_block(mi.ImageBlock(channels, film.crop_offset()))
         image = film.develop() if develop else mi.TensorXf()
         if evaluate:
@@ -194,10 +195,9 @@ class DeferredIntegrator(mi.SamplingIntegrator):
 
     # ---- One image ----
 
-    def _channels(self, scene, camera, spp, has_alpha, seed):
+    def _channels(self, scene, camera, film, has_alpha, seed):
         """[height, width, channels] in the layout of the film's block: R, G, B, (alpha,) weight, AOVs."""
-        width, height = camera.size
-        camera, samples = camera.subdivided(spp)
+        size, camera = camera.size, film.samples(camera)
         surfels, eta = surfels_in(scene)
         environment = self.environment(scene)
         image = deferred.render(surfels, camera, self.lighting(scene, surfels, eta, environment, seed))
@@ -209,7 +209,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         values = [*color, *([alpha] if has_alpha else []), mi.Float(1)]
         for kind in self.aovs.values():
             values += _aov(kind, image, maps, camera, rays)
-        return _average(values, width, height, samples)
+        return _tensor([film.develop(value, size) for value in values], size)
 
     def shading(self, eta: float) -> Shading:
         """Return how this integrator shades surfels of the index of refraction ``eta``."""
@@ -285,15 +285,14 @@ def _aov(kind, image, maps, camera, rays):
     return [value] if isinstance(value, mi.Float) else [*value]
 
 
-def _average(values, width, height, samples):
-    """[height, width, channels] means over samples × samples blocks of ``values``, which have one entry per sample."""
-    n = width * height * samples**2
-    flat = dr.empty(mi.Float, n * len(values))
-    row = dr.arange(mi.UInt32, n) * len(values)
+def _tensor(values, size):
+    """[height, width, channels] of ``values``, which have one entry per pixel of ``size`` (width, height)."""
+    width, height = size
+    flat = dr.empty(mi.Float, width * height * len(values))
+    row = dr.arange(mi.UInt32, width * height) * len(values)
     for k, value in enumerate(values):
         dr.scatter(flat, value, row + k)
-    tensor = mi.TensorXf(flat, (height, samples, width, samples, len(values)))
-    return dr.mean(tensor, axis=(1, 3)) if samples > 1 else dr.reshape(tensor, (height, width, len(values)))
+    return mi.TensorXf(flat, (height, width, len(values)))
 
 
 def _equal(a, b):

@@ -14,7 +14,7 @@ from ..core.camera import Camera
 from ..core.errors import UserError
 from ..core.inputs import JSON, read_file
 from ..core.ownership import owned
-from ..core.scene_files import load_scene, spp_of
+from ..core.scene_files import film_of, load_scene
 from ..datasets import load_dataset
 from ..evaluation import lpips
 from ..evaluation.evaluate import SCORES
@@ -62,7 +62,7 @@ def reevaluate(run: str | Path, data: str | Path | None = None, quiet: bool = Fa
     dataset, registration = _photographs(folder, scene, run, int(longest), quiet)
     with owned(run):
         mean, scores, rows, _ = results.measure(
-            surfels, lighting, dataset, background, spp_of(scene), run, quiet, registration
+            surfels, lighting, dataset, background, film_of(scene), run, quiet, registration
         )
         if not lpips.installed():
             _keep_lpips(saved, mean, scores)

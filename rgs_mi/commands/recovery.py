@@ -91,7 +91,7 @@ def _views(path, variables, size, quiet):
 
 
 def _render(scene, view, integrator=None):
-    sensor = mi.load_dict(sensor_dict(view.camera))
+    sensor = mi.load_dict(sensor_dict(view.camera, scene))
     return np.array(mi.render(scene, sensor=sensor, integrator=integrator or scene.integrator(), spp=spp_of(scene)))
 
 

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from .errors import UserError
+from .film import Film
 from .inputs import is_file
 
 _PACKAGE = Path(__file__).parents[1]
@@ -80,6 +81,11 @@ def _check_no_code(path):
                 raise UserError(
                     f"{found} is native code, which Mitsuba would run for {path}: move it, if you trust the scene"
                 )
+
+
+def film_of(scene: "mi.Scene") -> Film:
+    """Return the film of the scene's first sensor, of as many samples per pixel as it asks for."""
+    return Film.of(scene.sensors()[0].film().rfilter(), spp_of(scene))
 
 
 def spp_of(scene: "mi.Scene") -> int:

@@ -12,8 +12,11 @@ from functools import partial
 from pathlib import Path
 
 from ..core.errors import UserError
+from ..core.film import GAUSSIAN
+from ..core.inputs import is_file
 from .frames import Frame, load_views
 from .images import read_grey
+from .path_traced import MANIFEST
 from .points import sparse_points
 from .resolution import LONGEST
 from .transforms import frame_of, image_stem, read_json
@@ -43,7 +46,9 @@ def load(root: Path, longest: int = LONGEST) -> Dataset:
     splits = {"train": load_views(root / TRAIN, _frames(root / TRAIN, ()), longest), "test": []}
     if (root / TEST).is_file():
         splits["test"] = load_views(root / TEST, _frames(root / TEST, ("_normal.png", "_normal_0001.png")), longest)
-    return Dataset(**splits, points=points, point_colors=colors, root=root, photographed=PHOTOGRAPHED)
+    scaled = any(view.scaled_from for views in splits.values() for view in views)
+    rfilter = GAUSSIAN if is_file(root / MANIFEST) and not scaled else 0.0
+    return Dataset(**splits, points=points, point_colors=colors, root=root, photographed=PHOTOGRAPHED, rfilter=rfilter)
 
 
 def _frames(file: Path, normals: tuple[str, ...]) -> list[Frame]:

@@ -16,7 +16,7 @@ from .images import resize
 from .rims import without_rim
 from .types import DepthPrior, View
 
-MOST_PIXELS = 320_000  # that a step looks at: of larger windows one tile at a time, for more steps and less memory
+MOST_SAMPLES = 320_000  # that a step looks at: of larger windows one tile at a time, for more steps and less memory
 _CROP_MARGIN = 8  # pixels of background around the object that training looks at
 
 
@@ -52,7 +52,7 @@ class Photograph:
 class Photographs:
     """The training photographs of one pyramid level as the losses want them: display space, over the background, and
     cropped to windows of one size that hold the object in every view (one size, since each needs its own kernels), or, of
-    windows of more than `MOST_PIXELS`, to tiles of one size.
+    windows of more than `MOST_SAMPLES`, to tiles of one size.
 
     ``downscale`` is how many pixels of a view's side make one of the level's; ``background`` a display value; ``priors`` has
     one entry per view. Masks are too large by ``rim`` pixels of a view (`rims`). Where they may be wrong, within ``tolerance``
@@ -80,10 +80,11 @@ class Photographs:
         _, _, width, height = self._windows[0]
         return width, height
 
-    def tile(self, i: int, turn: int = 0) -> Photograph:
-        """Return what a step looks at of view ``i``: its window, or one of the tiles of it, whose ``turn`` it is."""
+    def tile(self, i: int, turn: int = 0, spp: int = 1) -> Photograph:
+        """Return what a step with ``spp`` samples per pixel looks at of view ``i``: its window, or one of the tiles of it, whose
+        ``turn`` it is."""
         view, (x, y, *_) = self.views[i], self._windows[i]
-        left, top, width, height = part = _tile(self.window, turn)
+        left, top, width, height = part = _tile(self.window, turn, spp)
         images, prior = self._planes(i, part)
         planes, depth = ([as_float(p.ravel()) for p in parts] for parts in (images, prior))
         behind = mi.Color3f(*planes[4:] or [self.background])
@@ -158,18 +159,19 @@ def _windows(views, downscale):
     return [(int(x), int(y), int(size[0]), int(size[1])) for x, y in corners]
 
 
-def tiling(window: tuple[int, int]) -> tuple[int, int]:
-    """Return into how many (columns, rows) of tiles a ``window`` (width, height) falls, of `MOST_PIXELS` at most."""
+def tiling(window: tuple[int, int], spp: int = 1) -> tuple[int, int]:
+    """Return into how many (columns, rows) of tiles a ``window`` (width, height) falls, which have `MOST_SAMPLES` at most,
+    ``spp`` a pixel."""
     (width, height), columns, rows = window, 1, 1
-    while width * height > MOST_PIXELS * columns * rows:
+    while width * height * spp > MOST_SAMPLES * columns * rows:
         columns, rows = (columns + 1, rows) if width * rows >= height * columns else (columns, rows + 1)
     return columns, rows
 
 
-def _tile(window, turn):
+def _tile(window, turn, spp):
     """(x, y, width, height) of the tile of a ``window`` (width, height) whose ``turn`` it is: one of a grid of equal tiles,
     which overlap."""
-    (width, height), (columns, rows) = window, tiling(window)
+    (width, height), (columns, rows) = window, tiling(window, spp)
     size = -(-width // columns), -(-height // rows)
     row, column = divmod(turn % (columns * rows), columns)
     place = lambda k, n, whole, part: round(k * (whole - part) / max(n - 1, 1))

@@ -45,7 +45,8 @@ class Dataset:
     """A capture in the folder ``root``. ``train`` is fitted, ``test`` is held out (and only ever looked at); ``points`` are
     world-space positions [N, 3] and ``point_colors`` linear colours [N, 3] of a sparse reconstruction where the layout has
     one. ``photographed`` says whether the images are photographs, whose cameras and exposures someone has estimated, or
-    path-traced ones, whose are known. ``origin`` is where the world's origin lies in the world of the files
+    path-traced ones, whose are known; ``rfilter`` by a Gaussian of which standard deviation, in pixels, their film has filtered
+    them (0: by a box of one pixel, or nobody knows). ``origin`` is where the world's origin lies in the world of the files
     (`world_frame.recentred`)."""
 
     train: list[View]
@@ -54,6 +55,7 @@ class Dataset:
     point_colors: np.ndarray | None = None
     root: Path = field(default_factory=Path)
     photographed: bool = False
+    rfilter: float = 0.0
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @cached_property

@@ -11,6 +11,7 @@ import numpy as np
 from ..core.arrays import as_float
 from ..core.camera import Camera
 from ..core.color import display
+from ..core.film import Film
 from ..datasets.types import View
 from ..fit import losses
 from ..shading import deferred
@@ -44,14 +45,14 @@ def render_view(
     lighting: Lighting | None,
     camera: Camera,
     background: float,
-    spp: int = 1,
+    film: Film = Film(),
     gain: np.ndarray | None = None,
 ) -> Rendering:
-    """Render ``surfels`` under ``lighting`` (None: diffuse only) over the display-space grey level ``background``, with
-    ``spp`` samples per pixel, rounded up to a square: linear radiance and all maps are means over a grid, as those of
-    'rgs_deferred'. The image, but no map, is exposed with ``gain`` [3]."""
+    """Render ``surfels`` under ``lighting`` (None: diffuse only) over the display-space grey level ``background``, on a
+    ``film``: linear radiance and all maps are weighted means over its samples, as those of 'rgs_deferred'. The image, but no map,
+    is exposed with ``gain`` [3]."""
     with dr.suspend_grad():
-        bands = [_means(surfels, lighting, band, spp) for band in _bands(camera, spp)]
+        bands = [_means(surfels, lighting, band, film) for band in _bands(camera, film)]
         means = {name: np.concatenate([band[name] for band in bands]) for name in bands[0]}
         alpha = means.pop("alpha")
         length = np.linalg.norm(means["sh_normal"], axis=-1, keepdims=True)
@@ -62,17 +63,16 @@ def render_view(
     return Rendering(np.clip(shown, 0, 1), alpha, means)
 
 
-def _bands(camera, spp):
+def _bands(camera, film):
     """The camera's picture in bands of `_MOST_SAMPLES` at most, or nearly so: what a band needs lies in memory at once."""
     width, height = camera.size
-    rows = max(TILE[1], _MOST_SAMPLES // (width * spp) // TILE[1] * TILE[1])
+    rows = max(TILE[1], _MOST_SAMPLES // (width * film.side**2) // TILE[1] * TILE[1])
     return [camera.cropped(0, y, width, min(rows, height - y)) for y in range(0, height, rows)]
 
 
-def _means(surfels, lighting, camera, spp):
-    """Maps of what ``camera`` sees, [H, W, channels], means over the samples of each pixel."""
-    (width, height), (fine, side) = camera.size, camera.subdivided(spp)
-    image = deferred.render(surfels, fine, lighting)
+def _means(surfels, lighting, camera, film):
+    """Maps of what ``camera`` sees, [H, W, channels], as the ``film`` develops them."""
+    (width, height), image = camera.size, deferred.render(surfels, film.samples(camera), lighting)
     m = image.gbuffer.all
     length = dr.norm(m.normal)
     maps = {
@@ -86,9 +86,10 @@ def _means(surfels, lighting, camera, spp):
         "depth": m.depth,
         "alpha": m.alpha,
     }
-    dr.eval(maps)
-    samples = {k: np.atleast_2d(v.numpy()).T.reshape(height, side, width, side, -1) for k, v in maps.items()}
-    return {k: v.mean((1, 3)) for k, v in samples.items()}
+    channels = {k: [v] if isinstance(v, mi.Float) else [*v] for k, v in maps.items()}
+    pixels = {k: [film.develop(channel, camera.size) for channel in v] for k, v in channels.items()}
+    dr.eval(pixels)
+    return {k: np.stack([v.numpy().reshape(height, width) for v in values], -1) for k, values in pixels.items()}
 
 
 def ground_truth(view: View, background: float) -> np.ndarray:
@@ -140,17 +141,17 @@ def _finite(value):
 
 
 def frames_per_second(
-    surfels: Surfels, lighting: Lighting | None, cameras: Sequence[Camera], spp: int = 1, seconds: float = 1.0
+    surfels: Surfels, lighting: Lighting | None, cameras: Sequence[Camera], film: Film = Film(), seconds: float = 1.0
 ) -> float:
     """Return the median of frames per second over renderings of ``cameras`` in turn, for some ``seconds`` and three at least,
-    with ``spp`` samples per pixel: G-buffer and shading, kernels compiled and the environment filtered beforehand."""
+    with the samples of a ``film``: G-buffer and shading, kernels compiled and the environment filtered beforehand."""
     spent = []
     with dr.suspend_grad():
         while len(spent) < 4 or sum(spent) < seconds:
             dr.sync_thread()
             start = time.perf_counter()
-            for band in _bands(cameras[len(spent) % len(cameras)], spp):
-                dr.eval(deferred.render(surfels, band.subdivided(spp)[0], lighting).color)
+            for band in _bands(cameras[len(spent) % len(cameras)], film):
+                dr.eval(deferred.render(surfels, film.samples(band), lighting).color)
             dr.sync_thread()
             spent.append(time.perf_counter() - start)
     return float(1 / np.median(spent[1:]))

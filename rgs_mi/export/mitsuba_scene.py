@@ -12,6 +12,7 @@ import numpy as np
 
 from ..core.errors import UserError
 from ..core.files import atomic_file, write_exr
+from ..core.film import rfilter
 from ..datasets.types import View
 from ..shading.environment import Environment
 from ..shading.lighting import Shading
@@ -35,13 +36,14 @@ def export(
     shader: Shader | None,
     views: Sequence[View],
     spp: int = 1,
+    stddev: float | None = None,
 ) -> list[Path]:
     """Write ``object.ply``, ``environment.exr``, ``shader.npz`` (where ``shader`` is not None, the identity) and
     ``scene.xml`` into ``folder`` and return their paths.
 
     The scene is the one that was fitted with the results in place of where the fit started, its ``shading``, and a sensor of
-    ``spp`` samples per pixel for each of ``views``, whose id is the view's name:
-    ``mi.render(mi.load_file("scene.xml", parallel=False), sensor=i)``.
+    ``spp`` samples per pixel, which a Gaussian of ``stddev`` pixels filters (0, None: a box), for each of ``views``, whose id is
+    the view's name: ``mi.render(mi.load_file("scene.xml", parallel=False), sensor=i)``.
     Raises: UserError where the disk is full or the folder can't be written.
     """
     folder = Path(folder)
@@ -67,7 +69,7 @@ def export(
     if any(abs(v.camera.focal[0] / v.camera.focal[1] - 1) > _SQUARE for v in views):
         warnings.warn(f"{folder / SCENE}: the cameras' pixels are not square, those of its sensors are", stacklevel=2)
     ids = sensor_ids([view.name for view in views], _ids(root))
-    root.extend(_sensor(view, name, spp) for view, name in zip(views, ids))
+    root.extend(_sensor(view, name, spp, rfilter(stddev)) for view, name in zip(views, ids))
     ET.indent(root, "    ")
     with atomic_file(folder / SCENE) as stream:
         ET.ElementTree(root).write(stream, encoding="utf-8", xml_declaration=True)
@@ -133,7 +135,7 @@ def _fitted(scene, surfels, environment, eta, properties):
     return root
 
 
-def _sensor(view, name, spp):
+def _sensor(view, name, spp, rfilter):
     d = view.camera.to_sensor_dict()
     sensor = ET.Element("sensor", type="perspective", id=name)
     numbers = ("fov", "principal_point_offset_x", "principal_point_offset_y")
@@ -143,9 +145,10 @@ def _sensor(view, name, spp):
             _element("integer", "width", d["film"]["width"]),
             _element("integer", "height", d["film"]["height"]),
             _element("string", "pixel_format", "rgba"),
-            ET.Element("rfilter", type="box"),
+            ET.Element("rfilter", type=rfilter["type"]),
         ]
     )
+    film[-1].extend(_element("float", key, value) for key, value in rfilter.items() if key != "type")
     sampler = ET.Element("sampler", type="independent")
     sampler.append(_element("integer", "sample_count", spp))
     sensor.extend(

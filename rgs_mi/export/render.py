@@ -116,7 +116,7 @@ def render_scene(
             step = lambda part: progress.update((k + part) / len(cameras))
             camera = camera.resized(*_size(size, camera.size))
             file = out if out.suffix == ".png" and not moves else out / f"{name}.png"
-            image = _render(scene, mi.load_dict(sensor_dict(camera)), integrator, spp, step)
+            image = _render(scene, mi.load_dict(sensor_dict(camera, scene)), integrator, spp, step)
             write_png(file, straight(image, exposure, tone))
             if aovs:
                 write_exr(file.with_suffix(".exr"), image, ["R", "G", "B", "A", *integrator.aov_names()])
@@ -142,9 +142,12 @@ def straight(image: np.ndarray, stops: float = 0.0, tone: str = "clip") -> np.nd
     return np.concatenate([exposed(image[..., :3] / np.maximum(alpha, 1e-6), stops, tone), alpha], -1)
 
 
-def sensor_dict(camera: Camera) -> dict:
-    """Return a sensor for ``mi.load_dict`` whose film has alpha."""
+def sensor_dict(camera: Camera, scene: "mi.Scene | None" = None) -> dict:
+    """Return a sensor for ``mi.load_dict`` whose film has alpha, and is filtered as that of the first sensor of ``scene``; by
+    a box where there is none."""
     sensor = camera.to_sensor_dict()
+    if scene is not None and scene.sensors():
+        sensor["film"]["rfilter"] = scene.sensors()[0].film().rfilter()
     sensor["film"]["pixel_format"] = "rgba"
     return sensor
 

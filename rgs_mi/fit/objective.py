@@ -8,6 +8,7 @@ import numpy as np
 
 from ..core.bounding_box import BoundingBox
 from ..core.camera import Camera, opaque
+from ..core.film import Film
 from ..datasets.photographs import Photograph
 from ..settings.settings import Settings
 from ..shading import deferred
@@ -24,7 +25,7 @@ CUTOFFS = Cutoffs(transmittance_min=1e-2)  # of a step: what the last hundredth 
 @dataclass
 class ViewLoss:
     """The losses of a view: weighted ``terms`` by the names that curves have for them, of width 1 each; what the ``photometric``
-    one is the mean of, pixel by pixel, not differentiated; the mean squared ``error`` in display values, of width 1; and
+    one is the mean of, of each sample's pixel, not differentiated; the mean squared ``error`` in display values, of width 1; and
     ``reflective`` [H, W] bool, β̂ of the view, None where nothing asks for it."""
 
     terms: "dict[str, mi.Float]"
@@ -56,14 +57,18 @@ class Objective:
         consistency: float,
         step: int,
         gain: "mi.Color3f | None" = None,
+        film: Film = Film(),
     ) -> ViewLoss:
-        """Return the losses of ``image``, a rendering of the view of ``photo``, which has a mask where ``masked``.
+        """Return the losses of ``image``, a rendering of the view of ``photo``, which has a mask where ``masked``: of the samples
+        of which a ``film`` makes its pixels.
 
         ``consistency`` is the weight of depth-normal consistency by now; ``step`` decides which quarter of the pixels
         minimum variation looks at; ``gain`` is the photograph's exposure, by which linear radiance is multiplied.
         """
         w, maps, size = self.settings.weights, image.gbuffer.all, photo.camera.size
+        camera = film.samples(photo.camera)
         color, alpha = losses.completed(image.color, maps.alpha, CUTOFFS.transmittance_min)
+        color, alpha = mi.Color3f(*(film.develop(c, size) for c in color)), film.develop(alpha, size)
         color = losses.evaluated_adjoint(color if gain is None else color * gain)
         rendered = losses.display(color, alpha, photo.behind)
         photometric = losses.photometric(rendered, photo.color, size, w.dssim)
@@ -75,20 +80,20 @@ class Objective:
         if w.distortion > 0:
             terms["distortion"] = w.distortion * losses.distortion(maps, self.extent)
         weight = dr.opaque(mi.Float, consistency)
-        terms["consistency"] = weight * losses.depth_normal_consistency(image.gbuffer, photo.camera)
+        terms["consistency"] = weight * losses.depth_normal_consistency(image.gbuffer, camera)
         # These are means over the whole photograph, of which tiles give an estimate
         part_of_image = photo.window[0] * photo.window[1] / (photo.size[0] * photo.size[1])
         terms = {name: part_of_image * term for name, term in terms.items()}
         error = dr.mean(dr.mean(dr.square(dr.detach(rendered) - photo.color))) * part_of_image
-        regional, reflective = self._regional(image.gbuffer, photo, step)
+        regional, reflective = self._regional(image.gbuffer, photo, film, step)
         terms = {f"loss.{name}": term for name, term in (terms | regional).items()}
-        return ViewLoss(terms, dr.detach(photometric), error, reflective)
+        return ViewLoss(terms, film.spread(dr.detach(photometric), size), error, reflective)
 
-    def _regional(self, gbuffer, photo, step):
+    def _regional(self, gbuffer, photo, film, step):
         """Losses that are normalized by regions of their own: RGS's L_normal and L_depth, and minimum variation; and β̂."""
         w, maps, terms, mask = self.settings.weights, gbuffer.all, {}, None
         if max(w.normal, w.minimum_variation) > 0 or self.settings.density.guided:
-            mask = self.reflective_mask(gbuffer, photo.camera)
+            mask = self.reflective_mask(gbuffer, film.samples(photo.camera))
             if w.normal > 0:
                 terms["normal"] = w.normal * losses.normal_smoothness(gbuffer, mask, w.crease)
             if w.minimum_variation > 0:
@@ -97,7 +102,9 @@ class Objective:
         if w.depth > 0 and photo.prior is not None:
             covered = maps.alpha > 0.5
             depth = maps.depth / dr.select(covered, maps.alpha, 1)
-            terms["depth"] = w.depth * losses.pearson_depth(depth, photo.prior, covered, photo.inverse)
+            terms["depth"] = w.depth * losses.pearson_depth(
+                depth, film.spread(photo.prior, photo.camera.size), covered, photo.inverse
+            )
         return terms, mask
 
     def residual(self, surfels: Surfels, lighting: Lighting, camera: Camera) -> "mi.Float":

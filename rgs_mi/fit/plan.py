@@ -15,6 +15,10 @@ _PHOTOGRAPHED, _UNMASKED = 15_000, 25_000  # a minute at most, of photographs, a
 _MOST_UNMASKED = 250_000  # more need time that each is then seen too rarely in, and memory
 _FIRST = 25_000  # surfels to start with, at least
 _COARSEST, _FINEST_FROM = 220, 0.2  # side of a square of as many pixels, about; the part of the fit before full resolution
+_SAMPLED_FROM, _SPP = (
+    0.85,
+    4,
+)  # the part of the fit before steps take more samples of a pixel than one, and how many they take then
 STEPS = 500, 1000  # of a level before the next: of one below half resolution, and of that
 LAST = 0.25  # of the fit: there half as fine is not fine enough, if every view can be seen once more
 LEAST_STEPS = 250  # that there must be time for at the next, up to half resolution
@@ -25,6 +29,7 @@ _OPEN = (
     "surfels",
     "stages",
     "mask_rim",
+    "rfilter",
     "box",
     "light",
     "turns",
@@ -39,7 +44,8 @@ def planned(settings: Settings, dataset: Dataset) -> Settings:
     - `initialization.surfels`: half of these, or three quarters where photographs have no masks; 25 000 at least;
     - `mask_rim`: of photographs, as far within their masks as the object begins (`rims.rim`);
     - `stages`: halves of halves down to the pixels of a square of some 220; from 20 % of the fit on all pixels, from 10 % on
-      half of them along a side, and so on.
+      half of them along a side, and so on; where a film has filtered them, from 85 % on with four samples a pixel;
+    - `rfilter`: that of the data set.
     """
     density, first, minutes = settings.density, settings.initialization.surfels, settings.minutes or 0
     bare = dataset.photographed and not any(view.masked for view in dataset.train)
@@ -52,13 +58,15 @@ def planned(settings: Settings, dataset: Dataset) -> Settings:
     edge = settings.mask_rim
     if edge is None:
         edge = rim(dataset.train) if dataset.photographed else 0
-    stages = settings.stages or _stages(int(np.prod(dataset.train[0].camera.size)))
+    rfilter = dataset.rfilter if settings.rfilter is None else settings.rfilter
+    stages = settings.stages or _stages(int(np.prod(dataset.train[0].camera.size)), rfilter > 0)
     return replace(
         settings,
         density=replace(density, max_surfels=most),
         initialization=replace(settings.initialization, surfels=first),
         stages=stages,
         mask_rim=edge,
+        rfilter=rfilter,
     )
 
 
@@ -75,7 +83,7 @@ def told(settings: Settings, dataset: Dataset) -> str:
             "light": settings.light,
             "density.max_surfels": settings.density.max_surfels,
         }
-        | ({"mask_rim": settings.mask_rim} if settings.mask_rim else {})
+        | {name: value for name in ("mask_rim", "rfilter") if (value := getattr(settings, name))}
         | ({} if settings.box is None else {"box": "[" + ", ".join(f"{v:.7g}" for v in settings.box) + "]"})
     )
     return (
@@ -103,8 +111,9 @@ def _foreground(view: View) -> float:
     return float(view.alpha.sum()) if view.masked else float(np.prod(view.camera.size))
 
 
-def _stages(pixels: int) -> tuple[Stage, ...]:
-    """The pyramid of photographs of so many ``pixels``."""
+def _stages(pixels: int, filtered: bool) -> tuple[Stage, ...]:
+    """The pyramid of photographs of so many ``pixels``, which a film has ``filtered`` or not."""
     halvings = max(1, round(np.log2(np.sqrt(pixels) / _COARSEST)))
     coarse = (Stage(_FINEST_FROM / 2 ** (k - 1), 2**k, 1) for k in range(halvings, 0, -1))
-    return *coarse, Stage(1.0, 1, 1)
+    full = (Stage(_SAMPLED_FROM, 1, 1), Stage(1.0, 1, 1, _SPP)) if filtered else (Stage(1.0, 1, 1),)
+    return *coarse, *full

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.film import Film
 from ..core.runtime import release_memory
 from ..datasets.photographs import Photographs, tiling
 from ..datasets.types import Dataset, DepthPrior
@@ -48,7 +49,7 @@ class _Level:
 
     def meta(self) -> dict:
         """What a checkpoint keeps."""
-        return {"downscale": self.stage.downscale, "steps": self.steps, "seconds": list(self.seconds)}
+        return {"downscale": self.stage.downscale, "spp": self.stage.spp, "steps": self.steps, "seconds": list(self.seconds)}
 
 
 class Fit:
@@ -111,7 +112,8 @@ class Fit:
                 learned.restore(arrays)
         fit.curves = Curves(meta["curves"])
         if level := meta["level"]:
-            stage = next((s for s in settings.stages or () if s.downscale == level["downscale"]), None)
+            known = level["downscale"], level["spp"]
+            stage = next((s for s in settings.stages or () if (s.downscale, s.spp) == known), None)
             fit._level = stage and _Level(stage, level["steps"], deque(level["seconds"], _PACE))
         return fit
 
@@ -145,6 +147,11 @@ class Fit:
         least = once if self.progress > 1 - LAST else OFTEN * once if full else LEAST_STEPS
         affordable = 60 * s.minutes - self.elapsed > least * seconds
         return finer if affordable and now.steps >= STEPS[full] else now.stage
+
+    @property
+    def film(self) -> Film:
+        """What makes the pixels of the photographs in use of a step's samples; that of all pixels is the photographs' own."""
+        return Film.gaussian(self.settings.rfilter if self.stage.downscale == 1 else 0.0, self.stage.spp)
 
     @property
     def sh_order(self) -> int:
@@ -324,7 +331,8 @@ class Fit:
         """Accumulate the gradients of view ``i``, and density control's ``statistics``; returns its loss's terms and the mean
         squared ``error``."""
         assert self.photographs is not None
-        photo, gain, terms = self.photographs.tile(i, self.views_used // len(self.dataset.train) + i), None, {}
+        turn, film, gain, terms = self.views_used // len(self.dataset.train) + i, self.film, None, {}
+        photo = self.photographs.tile(i, turn, film.side**2)
         if self.cameras:
             started = self.schedule.learns_cameras(self.progress)
             seen = self.cameras.see(i, photo.camera, self.settings.weights, started)
@@ -335,9 +343,10 @@ class Fit:
         dr.enable_grad(means2d_offset)
         contribution = dr.zeros(mi.Vector2f, len(self.model)) if self.density.weighs else None
         dr.enable_grad(contribution)
-        image = deferred.render(surfels, photo.camera, lighting, means2d_offset, CUTOFFS, self.objective.full, contribution)
+        camera = film.samples(photo.camera)
+        image = deferred.render(surfels, camera, lighting, means2d_offset, CUTOFFS, self.objective.full, contribution)
         consistency = self.schedule.value(self.settings.weights.consistency, self.progress)
-        loss = self.objective(image, photo, self.dataset.train[i].masked, consistency, self.step_number, gain)
+        loss = self.objective(image, photo, self.dataset.train[i].masked, consistency, self.step_number, gain, film)
         terms |= loss.terms
         total = sum(terms.values()) * weight
         if (weighed := image.gbuffer.all.contribution) is not None:
@@ -345,9 +354,10 @@ class Fit:
         dr.backward(total)
         gradient = dr.grad(means2d_offset) * (photo.part / weight)  # as if all of the window had been seen
         found = mi.Vector2f(0) if contribution is None else dr.grad(contribution)
-        statistics.add(gradient, found, image.gbuffer.seen, photo.size)
+        size = tuple(film.side * n for n in photo.size)  # of which the gradient is
+        statistics.add(gradient, found, image.gbuffer.seen, size)
         if loss.reflective is not None:
-            self.density.note_reflective(i, photo.camera, loss.reflective)
+            self.density.note_reflective(i, camera, loss.reflective)
         return dr.detach(terms) | {"error": loss.error}
 
     def _judge(self, error):

@@ -17,6 +17,7 @@ import numpy as np
 from .. import __version__, report
 from ..core.errors import UserError
 from ..core.files import write_json, write_png
+from ..core.film import Film
 from ..core.inputs import JSON, read_file
 from ..core.progress import Progress
 from ..core.runtime import cores, peak_rss_mb, release_memory
@@ -63,8 +64,9 @@ def write(fit: "Fit", scene: "FitScene", folder: Path, quiet: bool) -> None:
     views = evaluation_views(fit.dataset)
     registration = cameras.registration(fit.cameras, views)
     settings = fit.settings
+    film = Film.gaussian(settings.rfilter, settings.spp)
     mean, scores, rows, found = measure(
-        surfels, lighting, fit.dataset, settings.background, settings.spp, folder, quiet, registration
+        surfels, lighting, fit.dataset, settings.background, film, folder, quiet, registration
     )
     exported = export(
         folder,
@@ -75,6 +77,7 @@ def write(fit: "Fit", scene: "FitScene", folder: Path, quiet: bool) -> None:
         fit.model.shader(),
         [replace(view, camera=found[view.name].camera) for view in views],
         settings.spp,
+        settings.rfilter,
     )
     if fit.cameras:
         exported.append(cameras.write(folder, fit.cameras, fit.dataset, views, found))
@@ -90,7 +93,7 @@ def measure(
     lighting: Lighting | None,
     dataset: Dataset,
     background: float,
-    spp: int,
+    film: Film,
     folder: Path,
     quiet: bool,
     registration: Registration | None = None,
@@ -109,11 +112,11 @@ def measure(
             seen, unaligned = Registered(view.camera), {}
             if registration is not None:
                 start = registration.cameras.get(view.name, view.camera)
-                image = evaluate.render_view(surfels, lighting, start, background, spp).image
+                image = evaluate.render_view(surfels, lighting, start, background, film).image
                 unaligned = {UNALIGNED: metrics.psnr(image, evaluate.ground_truth(view, background))}
                 seen = register(registration, surfels, lighting, view, background)
             found[view.name] = seen
-            rendering = evaluate.render_view(surfels, lighting, seen.camera, background, spp, seen.gain)
+            rendering = evaluate.render_view(surfels, lighting, seen.camera, background, film, seen.gain)
             pictures.write_view(folder / "test", view, rendering, background, gbuffer=view.name in on_sheet)
             release_memory()  # LPIPS needs as much
             scores[view.name] = evaluate.score(view, rendering, background) | unaligned
@@ -126,7 +129,7 @@ def measure(
     reason = None
     if mean["lpips"] is None:
         reason = _TOO_SMALL if lpips.installed() else _NO_LPIPS
-    fps = evaluate.frames_per_second(surfels, lighting, [view.camera for view in views], spp)
+    fps = evaluate.frames_per_second(surfels, lighting, [view.camera for view in views], film)
     mean |= {"lpips_reason": reason, "render_fps": fps}
     if registration is not None:
         mean |= {"test_cameras": registration.words}

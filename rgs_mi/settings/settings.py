@@ -37,6 +37,7 @@ class Stage:
     views: int = Field(
         default=1, ge=1, le=256, description="So many views are rendered per step; losses are averaged (MVGS)."
     )
+    spp: int = Field(default=1, ge=1, le=16, description="Samples per pixel of a step, on a grid.")
 
 
 @dataclass(frozen=True, config=_MODEL)
@@ -254,6 +255,14 @@ class Settings:
         le=100,
         description="Pixels of a photograph that its mask may be off by: that near its border, what the photograph shows lies "
         "behind the object.",
+    )
+    rfilter: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="Standard deviation, in pixels, of the Gaussian that has filtered the photographs, as the reconstruction "
+        "filter of a film does; 0: a box of one pixel. Unless given, 0.5, as Mitsuba has it, for images that it path-traced, "
+        "else 0.",
     )
     mask_rim: int | None = Field(
         default=None,

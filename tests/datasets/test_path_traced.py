@@ -1,6 +1,7 @@
 """Rendered data sets: layout, cameras that reproject the geometry, normals, caching and resuming."""
 
 import json
+import shutil
 
 import mitsuba as mi
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from rgs_mi.core.camera import Camera
 from rgs_mi.core.errors import UserError
-from rgs_mi.datasets import path_traced
+from rgs_mi.datasets import load_dataset, path_traced
 
 SIZE, RADIUS = 32, 0.5
 SCENE = f"""<scene version="3.0.0">
@@ -70,6 +71,15 @@ def test_layout(dataset):
             assert photograph[0, 0, 3] == 0 and photograph[SIZE // 2, SIZE // 2, 3] == 255
             assert set(maps(stem)) == set(path_traced.AOV_CHANNELS)
     assert not [p for p in dataset.rglob("*") if ".tmp" in p.name]
+
+
+def test_data_sets_know_their_film(dataset, tmp_path):
+    """The Gaussian of Mitsuba's own, while pixels are as they were rendered; of images from elsewhere nobody knows it."""
+    assert load_dataset(dataset).rfilter == 0.5
+    assert load_dataset(dataset, longest=SIZE // 2).rfilter == 0
+    shutil.copytree(dataset, tmp_path / "copy")
+    (tmp_path / "copy" / path_traced.MANIFEST).unlink()
+    assert load_dataset(tmp_path / "copy").rfilter == 0
 
 
 def test_depth_and_pose_reproduce_the_geometry(dataset):

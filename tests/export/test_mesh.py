@@ -22,6 +22,7 @@ from rgs_mi.core.arrays import as_float
 from rgs_mi.core.camera import Camera
 from rgs_mi.core.color import srgb_encode
 from rgs_mi.core.errors import UserError
+from rgs_mi.core.film import Film
 from rgs_mi.core.scene_files import load_scene
 from rgs_mi.datasets.path_traced import train_directions
 from rgs_mi.evaluation.evaluate import render_view
@@ -385,7 +386,7 @@ def test_textures_are_fitted_to_photographs(exported):
     surfels, lighting = lit_surfels(scene, run)
     views = []
     for camera in cameras():
-        seen = render_view(surfels, lighting, camera, 0.0, 4)
+        seen = render_view(surfels, lighting, camera, 0.0, Film.gaussian(0, 4))
         color = seen.maps["color"] / np.maximum(seen.alpha, 1e-3)
         views.append(Photograph(camera, np.concatenate([color, seen.alpha > 0.9], 2).astype(np.float32), np.full(3, 0.5)))
         views[-1].pixels[..., :3] *= 0.5  # its exposure

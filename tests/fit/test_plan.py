@@ -63,8 +63,19 @@ def test_levels_begin_at_a_square_of_some_220_pixels(dataset, scale, stages):
     assert [(s.until, s.downscale) for s in found] == stages and {s.views for s in found} == {1}
 
 
+def test_steps_of_filtered_images_take_more_samples_in_the_end(dataset):
+    """A data set says how its images were filtered, unless someone does."""
+    large = with_pixels(dataset, 7)
+    plain, filtered = planned(Settings(), large), planned(Settings(), replace(large, rfilter=0.5))
+    assert plain.rfilter == 0 and filtered.rfilter == 0.5
+    assert [s.spp for s in plain.stages] == [1, 1]
+    assert [(s.until, s.downscale, s.spp) for s in filtered.stages] == [(0.2, 2, 1), (0.85, 1, 1), (1, 1, 4)]
+    assert planned(Settings(rfilter=0), replace(large, rfilter=0.5)).stages == plain.stages
+
+
 def test_what_is_asked_for_stays(dataset):
-    asked = replace(SETTINGS, density=Density(max_surfels=7), initialization=Initialization(surfels=5), mask_rim=2)
+    asked = replace(SETTINGS, density=Density(max_surfels=7), initialization=Initialization(surfels=5))
+    asked = replace(asked, mask_rim=2, rfilter=0.4)
     assert planned(asked, dataset) == asked
     few = planned(Settings(density=Density(max_surfels=7)), dataset)
     assert (few.density.max_surfels, few.initialization.surfels) == (7, 7)
@@ -109,7 +120,7 @@ def test_levels_wait_for_steps_and_time(dataset, monkeypatch):
     level.seconds.append(47.0 / LEAST_STEPS / 4**COST / 0.98)
     assert fit.stage.downscale == 4, "no time for it"
     width, height = fit.photographs.window
-    monkeypatch.setattr("rgs_mi.datasets.photographs.MOST_PIXELS", width * height)
+    monkeypatch.setattr("rgs_mi.datasets.photographs.MOST_SAMPLES", width * height)
     assert fit.stage.downscale == 2, "four tiles: steps take no longer"
     level.seconds.clear()
     level.seconds.append(47.0 / LEAST_STEPS * 1.1)

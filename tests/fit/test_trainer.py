@@ -11,8 +11,10 @@ from scipy import ndimage
 
 from rgs_mi.commands.optimize import start
 from rgs_mi.core.arrays import as_float
+from rgs_mi.core.film import Film
 from rgs_mi.datasets.photographs import Photographs
 from rgs_mi.datasets.types import DepthPrior
+from rgs_mi.evaluation.evaluate import render_view
 from rgs_mi.fit import losses, objective, schedule
 from rgs_mi.fit.density import Statistics
 from rgs_mi.fit.light_maps import STEPS, LightMaps
@@ -25,7 +27,7 @@ from rgs_mi.shading.lighting import Lighting, Shading
 from rgs_mi.shading.split_sum import SplitSum
 from rgs_mi.surfels.surfels import Surfels
 
-from fits import SETTINGS, model
+from fits import SETTINGS, model, photographed
 from scenes import sphere_surfels
 
 
@@ -47,6 +49,46 @@ def test_crops_hold_the_object_and_their_cameras_fit(dataset, downscale):
         assert np.abs(rendered - alpha.numpy()).mean() < 0.03  # a camera that is off by a pixel gives more
     assert len(sizes) == 1
     assert downscale > 1 or np.prod(sizes.pop()) < 0.8 * 83 * 75
+
+
+def test_photographs_are_seen_through_their_film(dataset):
+    """Those that a film has filtered are what the surfels that they show look like on it, and on none that is sharper."""
+    (surfels, lighting), stddev, spp = photographed(), 0.5, 4
+    film, sharp = Film.gaussian(stddev, spp), Film.gaussian(0, spp)
+
+    def filtered(view):
+        rendering = render_view(surfels, lighting, view.camera, 0.0, Film.gaussian(stddev, spp))
+        straight = rendering.image / np.maximum(rendering.alpha, 1e-3)
+        pixels = np.clip(np.concatenate([straight, rendering.alpha], 2), 0, 1)
+        return replace(view, pixels=(pixels * 255 + 0.5).astype(np.uint8))
+
+    filmed = replace(dataset, train=[filtered(view) for view in dataset.train])
+    photo = Photographs(filmed.train, 1, 1.0).tile(2, spp=spp)
+    fit = Fit(filmed, model(), replace(SETTINGS, rfilter=stddev, stages=(Stage(spp=spp),)), 1.0)
+    assert fit.film == film
+
+    def loss(film):
+        with dr.suspend_grad():
+            image = deferred.render(surfels, film.samples(photo.camera), lighting, cutoffs=objective.CUTOFFS)
+            found = fit.objective(image, photo, True, 0.0, 0, None, film)
+        return float(found.terms["loss.photometric"][0]), found.photometric
+
+    (own, spread), (other, _) = loss(film), loss(sharp)
+    assert own < 0.4 * other
+    assert dr.width(spread) == np.prod([film.samples_along(n) for n in photo.camera.size])
+
+
+def test_density_control_does_not_ask_for_the_number_of_samples(dataset):
+    """Lengths of gradients, but for what differs between samples of a pixel, and what surfels make of pictures are the same."""
+    found = []
+    for spp in (1, 4):
+        stages, density = (Stage(spp=spp),), replace(SETTINGS.density, prune_weight=0.05)
+        fit = Fit(dataset, model(), replace(SETTINGS, stages=stages, density=density), 1.0)
+        fit.photographs, statistics = Photographs(dataset.train, 1, 1.0), Statistics(300)
+        fit._view(2, fit.model.surfels(0), None, 1.0, statistics)
+        found.append([values.numpy().sum() for values in (statistics.gradient, statistics.weight, statistics.share)])
+    np.testing.assert_allclose(found[1][1:], found[0][1:], rtol=0.03)
+    assert found[1][0] == pytest.approx(found[0][0], rel=0.35)
 
 
 @pytest.mark.parametrize("downscale", [1, 2])
@@ -72,7 +114,7 @@ def test_photographs_keep_no_more_than_they_count(dataset):
 def test_photographs_that_are_not_kept_are_the_same(dataset, monkeypatch, downscale, rim):
     values = [np.where(v.pixels[..., 3] > 127, v.pixels[..., 3] / 255, np.nan).astype(np.float32) for v in dataset.train]
     of = lambda: Photographs(dataset.train, downscale, 1.0, [DepthPrior(v) for v in values], tolerance=3, rim=rim)
-    monkeypatch.setattr("rgs_mi.datasets.photographs.MOST_PIXELS", 600)  # several tiles
+    monkeypatch.setattr("rgs_mi.datasets.photographs.MOST_SAMPLES", 600)  # several tiles
     kept, made = of(), of()
     turns = [(view, turn) for view in range(3) for turn in range(2)]
     tiles = [kept.tile(view, turn) for view, turn in turns]
@@ -146,7 +188,7 @@ def test_tiles_of_a_large_window_estimate_it(dataset, monkeypatch):
         return float(loss["loss.photometric"][0]), float(loss["error"][0]), statistics.gradient.numpy()
 
     expected = measured()
-    monkeypatch.setattr("rgs_mi.datasets.photographs.MOST_PIXELS", width * height // 3)
+    monkeypatch.setattr("rgs_mi.datasets.photographs.MOST_SAMPLES", width * height // 3)
     covered, found = np.zeros((height, width), int), []
     for turn in range(4):
         tile = fit.photographs.tile(view, turn)

@@ -278,12 +278,34 @@ def test_constant_emitter_is_a_constant_map():
     assert np.allclose(mi.render(mi.load_dict(scene)).numpy(), expected, rtol=1e-3)
 
 
-def test_samples_are_averaged(ply):
-    scene = mi.load_string(XML, file=ply, spp="9")
-    fine = mi.load_string(XML.replace('"24"', '"72"').replace('"20"', '"60"'), file=ply)
+def filmed(rfilter, samples=1):
+    """The scene's XML with so many ``samples`` as pixels along each side of one, filtered by the element ``rfilter``."""
+    width, height = (f'value="{samples * n}"' for n in (24, 20))
+    return XML.replace('value="24"', width).replace('value="20"', height).replace("</film>", f"{rfilter}</film>")
+
+
+def test_samples_of_a_box_are_averaged(ply):
+    box = '<rfilter type="box"/>'
+    scene, fine = mi.load_string(filmed(box), file=ply, spp="9"), mi.load_string(filmed(box, 3), file=ply)
     expected = mi.render(fine).numpy().reshape(20, 3, 24, 3, 3).mean((1, 3))
     for spp in (0, 5, 9):  # 5 is rounded up to a square
         assert np.allclose(mi.render(scene, spp=spp).numpy(), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "rfilter, stddev", [("", 0.5), ('<rfilter type="gaussian"><float name="stddev" value="0.3"/></rfilter>', 0.3)]
+)
+def test_the_films_filter_weighs_samples(ply, rfilter, stddev):
+    """Mitsuba's own, Gaussian by default; away from the border, where a film has no samples beyond."""
+    samples = mi.render(mi.load_string(filmed('<rfilter type="box"/>', 3), file=ply)).numpy()
+    x = (np.arange(9) + 0.5) / 3 - 1.5  # from the middle of a pixel
+    weights = np.exp(-(x**2) / (2 * stddev**2))
+    weights /= weights.sum()
+    windows = np.lib.stride_tricks.sliding_window_view(samples, (9, 9), (0, 1))[::3, ::3]
+    expected = np.einsum("yxcij,i,j->yxc", windows, weights, weights)
+    image = mi.render(mi.load_string(filmed(rfilter), file=ply, spp="9")).numpy()
+    assert np.abs(image[1:-1, 1:-1] - expected).mean() < 1e-3  # samples lie in other tiles, and see surfels in another order
+    assert np.abs(samples[4:-4:3, 4:-4:3] - expected).mean() > 2e-3
 
 
 def test_parts_add_up():

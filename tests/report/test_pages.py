@@ -70,6 +70,7 @@ def test_settings_are_yaml_and_marked(run):
     assert marked == [
         "minutes",
         "iterations",
+        "rfilter",
         "mask_rim",
         "light",
         "checkpoint_seconds",
