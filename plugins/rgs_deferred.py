@@ -209,7 +209,7 @@ class DeferredIntegrator(mi.SamplingIntegrator):
         values = [*color, *([alpha] if has_alpha else []), mi.Float(1)]
         for kind in self.aovs.values():
             values += _aov(kind, image, maps, camera, rays)
-        return _tensor([film.develop(value, size) for value in values], size)
+        return _tensor(film.develop(values, size), size)
 
     def shading(self, eta: float) -> Shading:
         """Return how this integrator shades surfels of the index of refraction ``eta``."""

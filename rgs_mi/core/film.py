@@ -6,6 +6,7 @@ Photographs are no point samples: a film, or a lens, has blurred them, and what 
 """
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -56,11 +57,11 @@ class Film:
         width, height = (n + 2 * self.margin for n in camera.size)
         return camera.cropped(-self.margin, -self.margin, width, height).subdivided(self.side**2)[0]
 
-    def develop(self, values: "mi.Float", size: tuple[int, int]) -> "mi.Float":
-        """Return the pixels, (24), of a picture of ``size`` (width, height), row-major, from ``values``, those of its `samples`,
-        differentiably. What has width 1 stays as it is."""
-        if dr.width(values) == 1 or self.weights == (1.0,):
-            return values
+    def develop(self, values: "Sequence[mi.Float]", size: tuple[int, int]) -> "list[mi.Float]":
+        """Return the pixels, (24), of pictures of ``size`` (width, height), row-major, each from those of the ``values`` that its
+        `samples` have, differentiably. What has width 1 stays as it is."""
+        if self.weights == (1.0,):
+            return [*values]
         (width, height), line = size, self.samples_along(size[0])
         x, y = _places(width, self.samples_along(height))
         rows = self._weighed(values, y * line + x * self.side, 1)
@@ -68,11 +69,10 @@ class Film:
         return self._weighed(rows, y * (self.side * width) + x, width)
 
     def _weighed(self, values, first, apart):
-        """Sums of the `weights` times as many ``values``, so far ``apart``, from those at ``first`` on."""
-        total = mi.Float(0)
-        for k, weight in enumerate(self.weights):
-            total += weight * dr.gather(mi.Float, values, first + k * apart)
-        return total
+        """Sums of the `weights` times as many of each of ``values``, so far ``apart``, from those at ``first`` on."""
+        dr.eval(values)  # together: what they come from is computed once
+        weighed = lambda value: sum(w * dr.gather(mi.Float, value, first + k * apart) for k, w in enumerate(self.weights))
+        return [value if dr.width(value) == 1 else weighed(value) for value in values]
 
     def samples_along(self, pixels: int) -> int:
         """Return how many samples lie along so many ``pixels``, those of the margins among them."""

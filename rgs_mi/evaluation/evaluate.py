@@ -87,8 +87,8 @@ def _means(surfels, lighting, camera, film):
         "alpha": m.alpha,
     }
     channels = {k: [v] if isinstance(v, mi.Float) else [*v] for k, v in maps.items()}
-    pixels = {k: [film.develop(channel, camera.size) for channel in v] for k, v in channels.items()}
-    dr.eval(pixels)
+    dr.eval(channels)
+    pixels = {k: film.develop(values, camera.size) for k, values in channels.items()}
     return {k: np.stack([v.numpy().reshape(height, width) for v in values], -1) for k, values in pixels.items()}
 
 

@@ -68,8 +68,8 @@ class Objective:
         w, maps, size = self.settings.weights, image.gbuffer.all, photo.camera.size
         camera = film.samples(photo.camera)
         color, alpha = losses.completed(image.color, maps.alpha, CUTOFFS.transmittance_min)
-        color, alpha = mi.Color3f(*(film.develop(c, size) for c in color)), film.develop(alpha, size)
-        color = losses.evaluated_adjoint(color if gain is None else color * gain)
+        *color, alpha = film.develop([*color, alpha], size)
+        color = losses.evaluated_adjoint(mi.Color3f(*color) if gain is None else mi.Color3f(*color) * gain)
         rendered = losses.display(color, alpha, photo.behind)
         photometric = losses.photometric(rendered, photo.color, size, w.dssim)
         terms = {"photometric": dr.mean(photometric)}

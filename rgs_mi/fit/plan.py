@@ -15,10 +15,7 @@ _PHOTOGRAPHED, _UNMASKED = 15_000, 25_000  # a minute at most, of photographs, a
 _MOST_UNMASKED = 250_000  # more need time that each is then seen too rarely in, and memory
 _FIRST = 25_000  # surfels to start with, at least
 _COARSEST, _FINEST_FROM = 220, 0.2  # side of a square of as many pixels, about; the part of the fit before full resolution
-_SAMPLED_FROM, _SPP = (
-    0.85,
-    4,
-)  # the part of the fit before steps take more samples of a pixel than one, and how many they take then
+_SAMPLED_FROM, _SPP = 0.85, 4  # the part of a fit before steps take more samples of a pixel, and how many they take then
 STEPS = 500, 1000  # of a level before the next: of one below half resolution, and of that
 LAST = 0.25  # of the fit: there half as fine is not fine enough, if every view can be seen once more
 LEAST_STEPS = 250  # that there must be time for at the next, up to half resolution

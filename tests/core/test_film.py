@@ -42,7 +42,8 @@ def test_pixels_are_those_of_mitsubas_film(name, spp):
     block.put(mi.Point2f(x.ravel().astype(np.float32), y.ravel().astype(np.float32)), [samples, mi.Float(1)])
     weighed = np.array(block.tensor())
     theirs = weighed[..., 0] / weighed[..., 1]
-    ours = film.develop(samples, SIZE).numpy().reshape(SIZE[::-1])
+    (pixels,) = film.develop([samples], SIZE)
+    ours = pixels.numpy().reshape(SIZE[::-1])
     np.testing.assert_allclose(ours, theirs, atol=6e-3 if name in ("gaussian", "wide") else 1e-5)  # tails are left out
 
 
@@ -51,11 +52,11 @@ def test_the_adjoint_is_the_transpose(spp):
     film = film_of("gaussian", spp)
     samples, _ = sampled(film)
     dr.enable_grad(samples)
-    pixels = film.develop(samples, SIZE)
+    (pixels,) = film.develop([samples], SIZE)
     adjoint = mi.Float(np.random.default_rng(1).uniform(size=SIZE[0] * SIZE[1]).astype(np.float32))
     dr.backward(pixels * adjoint)
     direction, _ = sampled(film, 2)
-    moved = film.develop(direction, SIZE)
+    (moved,) = film.develop([direction], SIZE)
     assert dr.sum(dr.grad(samples) * direction)[0] == pytest.approx(dr.sum(adjoint * moved)[0], rel=1e-5)
 
 
@@ -63,8 +64,9 @@ def test_what_is_the_same_everywhere_stays_so():
     for name in FILTERS:
         film = film_of(name, 4)
         one = dr.full(mi.Float, 0.7, dr.width(sampled(film)[0]))
-        np.testing.assert_allclose(film.develop(one, SIZE).numpy(), 0.7, rtol=1e-6)
-        assert film.develop(mi.Float(0.7), SIZE).numpy() == np.float32(0.7)
+        pixels, narrow = film.develop([one, mi.Float(0.7)], SIZE)
+        np.testing.assert_allclose(pixels.numpy(), 0.7, rtol=1e-6)
+        assert narrow.numpy() == np.float32(0.7)
 
 
 def test_samples_lie_around_their_pixels():
