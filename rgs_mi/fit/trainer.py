@@ -112,7 +112,7 @@ class Fit:
                 learned.restore(arrays)
         fit.curves = Curves(meta["curves"])
         if level := meta["level"]:
-            known = level["downscale"], level["spp"]
+            known = level["downscale"], level.get("spp", 1)
             stage = next((s for s in settings.stages or () if (s.downscale, s.spp) == known), None)
             fit._level = stage and _Level(stage, level["steps"], deque(level["seconds"], _PACE))
         return fit
@@ -236,13 +236,13 @@ class Fit:
         has another row."""
         start, pixels, progress = time.monotonic(), self.pixels, self.progress
         stage = self.stage
-        if self._level is None or stage != self._level.stage:
-            self._level = _Level(stage)
         if self.photographs is None or self.photographs.downscale != stage.downscale:
             s = self.settings
             self.photographs = Photographs(
                 self.dataset.train, stage.downscale, s.background, self.priors, s.mask_tolerance, s.mask_rim
             )
+        if self._level is None or stage != self._level.stage:
+            self._level = _Level(stage)
             release_memory()  # of arrays of sizes that do not come again
         self._follow_schedule()
         views = self._next_views(stage.views * self.ranks.size)[self.ranks.rank :: self.ranks.size]
