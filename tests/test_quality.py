@@ -37,8 +37,9 @@ SETTINGS = [
     "checkpoint_seconds=1000",
 ]
 SEED = 0
-#: Mean and standard deviation of eight seeds, 0 to 7. They lay within 29.37 to 29.78 dB, and within 2.74° to 2.85°.
-MEASURED = {"psnr": (29.59, 0.13), "normal_mae_deg": (2.790, 0.036)}
+#: Mean and standard deviation of eight seeds, 0 to 7. They lay within 30.22 to 30.53 dB, and within 2.49° to 2.58°; before
+#: photographs were seen through their film their means were 29.59 dB and 2.79°.
+MEASURED = {"psnr": (30.39, 0.13), "normal_mae_deg": (2.541, 0.030)}
 MARGIN = 2.7  # standard deviations. A change for the better is to be recorded, too
 
 

@@ -35,7 +35,7 @@ def render_scene(
     poses: Sequence[str] = (),
     turntable: int | None = None,
     along: int | None = None,
-    filmed: bool = False,
+    as_video: bool = False,
     size: int | tuple[int, int] | None = None,
     spp: int | None = None,
     out: str | Path | None = None,
@@ -60,7 +60,7 @@ def render_scene(
                  up axis, at the sensors' mean distance and elevation
       along:     instead of a view, that many frames of a camera that moves from sensor to sensor in their order, which for
                  a run is that of its test views (0: the sensors themselves)
-      filmed:    whether to write the frames as a video and a contact sheet, too (`video.write`)
+      as_video:    whether to write the frames as a video and a contact sheet, too (`video.write`)
       size:      width in pixels, of which the height follows, or both (default: the sensor's)
       spp:       samples per pixel; a square number for 'rgs_deferred' (default: what the first sensor says)
       out:       a folder, or a PNG for a single view (default: ``renders``, ``turntable`` or ``path`` beside the scene)
@@ -83,7 +83,7 @@ def render_scene(
     ):
         if any(n is not None and not 1 <= n <= most for n in numbers):
             raise UserError(f"{option} {'x'.join(map(str, numbers))}: needs 1 to {most}")
-    if filmed:
+    if as_video:
         if not moves:
             raise UserError("--video: one view makes no video: add --turntable N or --path")
         video.check()
@@ -121,7 +121,7 @@ def render_scene(
             if aovs:
                 write_exr(file.with_suffix(".exr"), image, ["R", "G", "B", "A", *integrator.aov_names()])
             written.append(file)
-    return written + (video.write(out, written) if filmed else [])
+    return written + (video.write(out, written) if as_video else [])
 
 
 def _render(scene, sensor, integrator, spp, progress):

@@ -85,7 +85,7 @@ def render(parser: Parser) -> Run:
             poses=args.poses,
             turntable=args.turntable,
             along=args.path,
-            filmed=args.video,
+            as_video=args.video,
             size=args.size,
             spp=args.spp,
             out=args.out,

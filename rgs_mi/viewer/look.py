@@ -69,7 +69,7 @@ class Look:
         return self.light != OWN or bool(self.rotate or self.brighten or self.changes())
 
     def options(self, distance: float, keys: Sequence[Camera] = (), frames: int = 0) -> list[str]:
-        """Return what `rgs-mi render` takes behind a scene's name to make the same picture, with 16 samples a pixel, or a film
+        """Return what `rgs-mi render` takes behind a scene's name to make the same picture, with 16 samples a pixel, or a video
         of so many ``frames`` through the cameras ``keys``, with 4; they look at points at that ``distance``, world units. What is
         no radiance comes with ``--aovs``."""
         cameras = list(keys) or [self.camera]

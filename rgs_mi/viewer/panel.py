@@ -9,8 +9,8 @@ from PIL import Image
 
 from ..core.color import TONES
 from .checks import choice, number
-from .film import Film
 from .frusta import Frusta
+from .key_frames import KeyFrames
 from .look import BACKGROUNDS, OWN
 from .maps import MAPS
 from .pace import GRIDS
@@ -180,9 +180,9 @@ class Panel:
             self._button("screenshot", self._screenshot)
             self._command = self._gui.add_text("command", "", multiline=True)
             self._button("update the command", self._tell_command)
-        with self._gui.add_folder("Film", expand_by_default=False):
-            self._film = Film(self._client, self._window, self._server)
-            self._film.controls(self._gui, self._button)
+        with self._gui.add_folder("Video", expand_by_default=False):
+            self._key_frames = KeyFrames(self._client, self._window, self._server)
+            self._key_frames.controls(self._gui, self._button)
 
     def _screenshot(self):
         """Have the picture that is seen downloaded."""
@@ -197,8 +197,8 @@ class Panel:
         look = replace(look, camera=seen(subject, look))
         distance = float(np.linalg.norm(look.camera.origin - subject.center))
         lines = [look.command(self._server.name, distance)]
-        if keys := self._film.keys:
-            lines.append(look.command(self._server.name, distance, keys, self._film.frames))
+        if keys := self._key_frames.keys:
+            lines.append(look.command(self._server.name, distance, keys, self._key_frames.frames))
         self._command.value = "\n".join(lines)
 
     # ---- Pictures ----

@@ -81,7 +81,7 @@ def test_no_encoder(frames, tmp_path, monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     for call in (
         lambda: video.write(tmp_path / "out", frames),
-        lambda: render.render_scene(tmp_path / "missing.xml", turntable=3, filmed=True),
+        lambda: render.render_scene(tmp_path / "missing.xml", turntable=3, as_video=True),
     ):
         with pytest.raises(UserError, match="pip install imageio-ffmpeg"):
             call()
@@ -94,7 +94,7 @@ def test_no_encoder(frames, tmp_path, monkeypatch):
         ({"turntable": -3}, "needs 1"),
         ({"along": -1}, "--path -1: needs"),
         ({"along": 10**9}, "to 10000 frames"),
-        ({"filmed": True}, "add --turntable N or --path"),
+        ({"as_video": True}, "add --turntable N or --path"),
     ],
 )
 def test_mistakes(tmp_path, options, message):

@@ -1,4 +1,4 @@
-"""Key frames of one window, and the film through them."""
+"""Key frames of one window, and the video through them."""
 
 import tempfile
 from collections.abc import Callable, Generator
@@ -29,8 +29,8 @@ _SIZE = 800  # pixels along the longer side of a frame, at most
 FRAMES = (12, 240)
 
 
-class Film:
-    """The key frames of one ``window``: ``keys``, cameras of one size, and how many ``frames`` a film through them has."""
+class KeyFrames:
+    """The key frames of one ``window``: ``keys``, cameras of one size, and how many ``frames`` a video through them has."""
 
     def __init__(self, client: "viser.ClientHandle", window: "Window", server: "Server") -> None:
         self._client, self._window, self._server = client, window, server
@@ -48,7 +48,7 @@ class Film:
 
         button("add this view", self.add)
         button("forget all", self.forget)
-        button("make the film", self.start)
+        button("make the video", self.start)
 
     def add(self) -> None:
         """Make what the window sees the next key frame."""
@@ -64,7 +64,7 @@ class Film:
         self._tell("no key frames")
 
     def start(self) -> None:
-        """Make the film, a pass a turn, and have it downloaded."""
+        """Make the video, a pass a turn, and have it downloaded."""
         if self._running or len(self.keys) < 2:
             self._tell("it is being made" if self._running else "needs two key frames")
             return
@@ -101,8 +101,8 @@ class Film:
 
 
 def made(subject: Subject, look: Look, keys: list[Camera], frames: int) -> Generator[float | bytes]:
-    """Make a film of ``frames`` on a smooth path through ``keys``, of what ``look`` shows: yield the part that is done after each
-    pass, and at last the video."""
+    """Make a video of ``frames`` on a smooth path through ``keys``, of what ``look`` shows: yield the part that is done after
+    each pass, and at last the video."""
     with tempfile.TemporaryDirectory() as folder:
         files = []
         for k, camera in enumerate(smooth_path(keys, frames)):
