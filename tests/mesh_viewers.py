@@ -13,7 +13,6 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from scipy import ndimage
 from scipy.spatial import KDTree
 
 import rgs_mi
@@ -92,27 +91,18 @@ def background(scene, camera):
     import mitsuba as mi
 
     from rgs_mi.core.camera import opaque, pixel_directions
+    from rgs_mi.core.film import GAUSSIAN, Film
 
-    (width, height), (fine, side) = camera.size, camera.subdivided(GRID**2)
-    direction = pixel_directions(fine, dr.arange(mi.UInt32, width * height * side**2))
+    film = Film.gaussian(GAUSSIAN, GRID**2)
+    fine = film.samples(camera)
+    direction = pixel_directions(fine, dr.arange(mi.UInt32, int(np.prod(fine.size))))
     hit = scene.ray_test(mi.Ray3f(opaque(camera).origin, direction))
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(hit))
     si.wi = -direction
-    behind = dr.select(hit, 0, scene.environment().eval(si)).numpy().T
-    film = lambda values: _film(values.reshape(height * side, width * side, -1), side)
-    return film(hit.numpy().astype(np.float32)), film(behind)
-
-
-def _film(values, side):
-    """[H, W, channels] of ``side`` × ``side`` values a pixel: what Mitsuba's Gaussian filter makes of them."""
-    reach = 2 * side  # its radius is four standard deviations
-    offset = (np.arange(-reach, reach) + 0.5) / side
-    weight = np.maximum(np.exp(-2 * offset**2) - np.exp(-8), 0)
-    weight /= weight.sum()
-    for axis in (0, 1):  # an even number of weights about the middle of a pixel, which lies between two values
-        values = ndimage.correlate1d(values, weight, axis, mode="nearest", origin=0)
-        values = np.take(values, np.arange(side // 2, values.shape[axis], side), axis)
-    return values
+    behind = dr.select(hit, 0, scene.environment().eval(si))
+    pixels = film.develop([mi.Float(dr.select(hit, 1, 0)), *behind], camera.size)
+    filled, *light = (values.numpy().reshape(camera.size[::-1]) for values in pixels)
+    return filled[..., None], np.stack(light, -1)
 
 
 def apart(one, other, cameras):

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .arrays import as_float
 from .camera import Camera
 
 #: Standard deviation, in pixels, of the Gaussian that Mitsuba's films have by default
@@ -34,7 +35,7 @@ class Film:
         side = int(np.ceil(np.sqrt(spp)))
         margin = int(np.ceil(max(rfilter.radius() - 0.5, 0)))
         offset = (np.arange((2 * margin + 1) * side) + 0.5) / side - margin - 0.5
-        weights = rfilter.eval(mi.Float(offset.astype(np.float32))).numpy().astype(np.float64)
+        weights = rfilter.eval(as_float(offset)).numpy().astype(np.float64)
         rows = weights.reshape(2 * margin + 1, side)
         while len(rows) > 1 and abs(rows[[0, -1]]).max() < _NEGLIGIBLE * abs(rows).max():
             rows = rows[1:-1]

@@ -69,7 +69,7 @@ def export(
     if any(abs(v.camera.focal[0] / v.camera.focal[1] - 1) > _SQUARE for v in views):
         warnings.warn(f"{folder / SCENE}: the cameras' pixels are not square, those of its sensors are", stacklevel=2)
     ids = sensor_ids([view.name for view in views], _ids(root))
-    root.extend(_sensor(view, name, spp, rfilter(stddev)) for view, name in zip(views, ids))
+    root.extend(_sensor(view, name, spp, stddev) for view, name in zip(views, ids))
     ET.indent(root, "    ")
     with atomic_file(folder / SCENE) as stream:
         ET.ElementTree(root).write(stream, encoding="utf-8", xml_declaration=True)
@@ -135,8 +135,8 @@ def _fitted(scene, surfels, environment, eta, properties):
     return root
 
 
-def _sensor(view, name, spp, rfilter):
-    d = view.camera.to_sensor_dict()
+def _sensor(view, name, spp, stddev):
+    d, kind = view.camera.to_sensor_dict(), rfilter(stddev)
     sensor = ET.Element("sensor", type="perspective", id=name)
     numbers = ("fov", "principal_point_offset_x", "principal_point_offset_y")
     film = ET.Element("film", type="hdrfilm")
@@ -145,10 +145,10 @@ def _sensor(view, name, spp, rfilter):
             _element("integer", "width", d["film"]["width"]),
             _element("integer", "height", d["film"]["height"]),
             _element("string", "pixel_format", "rgba"),
-            ET.Element("rfilter", type=rfilter["type"]),
+            ET.Element("rfilter", type=kind.pop("type")),
         ]
     )
-    film[-1].extend(_element("float", key, value) for key, value in rfilter.items() if key != "type")
+    film[-1].extend(_element("float", key, value) for key, value in kind.items())
     sampler = ET.Element("sampler", type="independent")
     sampler.append(_element("integer", "sample_count", spp))
     sensor.extend(

@@ -60,7 +60,7 @@ def render_scene(
                  up axis, at the sensors' mean distance and elevation
       along:     instead of a view, that many frames of a camera that moves from sensor to sensor in their order, which for
                  a run is that of its test views (0: the sensors themselves)
-      as_video:    whether to write the frames as a video and a contact sheet, too (`video.write`)
+      as_video:  whether to write the frames as a video and a contact sheet, too (`video.write`)
       size:      width in pixels, of which the height follows, or both (default: the sensor's)
       spp:       samples per pixel; a square number for 'rgs_deferred' (default: what the first sensor says)
       out:       a folder, or a PNG for a single view (default: ``renders``, ``turntable`` or ``path`` beside the scene)

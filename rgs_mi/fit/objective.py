@@ -66,7 +66,8 @@ class Objective:
         minimum variation looks at; ``gain`` is the photograph's exposure, by which linear radiance is multiplied.
         """
         w, maps, size = self.settings.weights, image.gbuffer.all, photo.camera.size
-        camera = film.samples(photo.camera)
+        prior = None if photo.prior is None else film.spread(photo.prior, size)
+        samples = replace(photo, camera=film.samples(photo.camera), prior=prior)
         color, alpha = losses.completed(image.color, maps.alpha, CUTOFFS.transmittance_min)
         *color, alpha = film.develop([*color, alpha], size)
         color = losses.evaluated_adjoint(mi.Color3f(*color) if gain is None else mi.Color3f(*color) * gain)
@@ -80,20 +81,20 @@ class Objective:
         if w.distortion > 0:
             terms["distortion"] = w.distortion * losses.distortion(maps, self.extent)
         weight = dr.opaque(mi.Float, consistency)
-        terms["consistency"] = weight * losses.depth_normal_consistency(image.gbuffer, camera)
+        terms["consistency"] = weight * losses.depth_normal_consistency(image.gbuffer, samples.camera)
         # These are means over the whole photograph, of which tiles give an estimate
         part_of_image = photo.window[0] * photo.window[1] / (photo.size[0] * photo.size[1])
         terms = {name: part_of_image * term for name, term in terms.items()}
         error = dr.mean(dr.mean(dr.square(dr.detach(rendered) - photo.color))) * part_of_image
-        regional, reflective = self._regional(image.gbuffer, photo, film, step)
+        regional, reflective = self._regional(image.gbuffer, samples, step)
         terms = {f"loss.{name}": term for name, term in (terms | regional).items()}
         return ViewLoss(terms, film.spread(dr.detach(photometric), size), error, reflective)
 
-    def _regional(self, gbuffer, photo, film, step):
+    def _regional(self, gbuffer, photo, step):
         """Losses that are normalized by regions of their own: RGS's L_normal and L_depth, and minimum variation; and β̂."""
         w, maps, terms, mask = self.settings.weights, gbuffer.all, {}, None
         if max(w.normal, w.minimum_variation) > 0 or self.settings.density.guided:
-            mask = self.reflective_mask(gbuffer, film.samples(photo.camera))
+            mask = self.reflective_mask(gbuffer, photo.camera)
             if w.normal > 0:
                 terms["normal"] = w.normal * losses.normal_smoothness(gbuffer, mask, w.crease)
             if w.minimum_variation > 0:
@@ -102,9 +103,7 @@ class Objective:
         if w.depth > 0 and photo.prior is not None:
             covered = maps.alpha > 0.5
             depth = maps.depth / dr.select(covered, maps.alpha, 1)
-            terms["depth"] = w.depth * losses.pearson_depth(
-                depth, film.spread(photo.prior, photo.camera.size), covered, photo.inverse
-            )
+            terms["depth"] = w.depth * losses.pearson_depth(depth, photo.prior, covered, photo.inverse)
         return terms, mask
 
     def residual(self, surfels: Surfels, lighting: Lighting, camera: Camera) -> "mi.Float":
