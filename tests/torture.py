@@ -308,8 +308,10 @@ def poison(root, number, undisturbed):
     def poisoned_step(self):
         recorded = step(self)
         if self.step_number == when and what in ("surfels", "environment"):
-            name = ENVIRONMENT if what == "environment" else rng.choice(["centers", "scales", "roughness", "sh_dc"])
-            values = np.array(self.model[name].numpy())
+            name = (
+                ENVIRONMENT if what == "environment" else rng.choice(["centers", "log_scales", "logit_roughness", "sh_dc"])
+            )
+            values = self.model.numpy(name)
             values.reshape(-1)[rng.randrange(values.size)] = np.nan
             self.model.set(name, values)
         return recorded
@@ -319,8 +321,8 @@ def poison(root, number, undisturbed):
         if self.step_number == when and what == "gradient":
             import drjit as dr
 
-            leaf = arguments[1].centers
-            dr.set_grad(leaf, dr.grad(leaf) * np.nan)
+            _, rows, _ = self.model._taken[-1]
+            dr.set_grad(rows, dr.grad(rows) * np.nan)
         if self.step_number == when and what == "view":
             found["error"] = mi.Float(np.nan)
         return found

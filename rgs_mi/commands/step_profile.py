@@ -17,9 +17,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..datasets.photographs import Photographs
-from ..fit import losses
+from ..fit import losses, rows
 from ..fit.cameras import Cameras
 from ..fit.density import DensityControl, Statistics
+from ..fit.model import Model
 from ..fit.objective import Objective
 from ..shading import deferred, prefilter
 from ..shading.indirect import Indirect
@@ -31,7 +32,7 @@ from ..surfels import surfels
 STAGES = {
     "photograph": ((Photographs, "tile"),),
     "environment's filters": ((prefilter, "apply"), (prefilter._Apply, "backward")),
-    "projection": ((deferred, "render_gbuffer"),),
+    "projection": ((Model, "in_view"), (Model, "take"), (deferred, "render_gbuffer")),
     "lists": ((gbuffer, "isect_tiles"),),
     "forward": ((gbuffer, "composite"),),
     "shading": ((deferred, "shade"),),
@@ -41,12 +42,13 @@ STAGES = {
         (Objective, "environment"),
         (losses._Blur, "backward"),
         (losses._Shifted, "backward"),
+        (surfels._Split, "backward"),
     ),
     "shading, back": ((gbuffer._Planes, "backward"), (composite, "_gather_image")),
     "backward": ((composite.Composite, "backward"),),
-    "projection, back": ((Statistics, "add"), (surfels._Split, "backward")),
+    "projection, back": ((Statistics, "add"), (rows._Columns, "backward"), (Model, "gradients")),
     "density control": ((DensityControl, "note_reflective"), (DensityControl, "refine")),
-    "optimizer": ((drjit.opt.Optimizer, "step"),),
+    "optimizer": ((rows.Rows, "step"), (drjit.opt.Optimizer, "step")),
     "cameras": ((Cameras, "see"), (Cameras, "step")),
 }
 REST = "the rest"

@@ -18,11 +18,19 @@ def as_float(values: np.ndarray) -> "mi.Float":
     return mi.Float(memory)
 
 
-def aligned(*shape: int) -> np.ndarray:
-    """Return zeros of this ``shape`` in single precision, in memory aligned as Dr.Jit's own, in which it lets them lie."""
-    size = int(np.prod(shape))
-    memory = np.zeros(size + _ALIGNMENT // 4, np.float32)
-    first = -memory.ctypes.data % _ALIGNMENT // 4
+def as_half(values: np.ndarray) -> "mi.Float16":
+    """Return ``values`` (any shape) flattened, in half precision, in memory aligned as Dr.Jit's own (see `as_float`)."""
+    memory = aligned(*np.shape(values), kind=np.float16)
+    memory[:] = values
+    return mi.Float16(memory.ravel())
+
+
+def aligned(*shape: int, kind: type = np.float32) -> np.ndarray:
+    """Return zeros of this ``shape`` and ``kind``, single precision as a rule, in memory aligned as Dr.Jit's own, in which it
+    lets them lie."""
+    size, each = int(np.prod(shape)), np.dtype(kind).itemsize
+    memory = np.zeros(size + _ALIGNMENT // each, kind)
+    first = -memory.ctypes.data % _ALIGNMENT // each
     return memory[first : first + size].reshape(shape)
 
 

@@ -3,12 +3,13 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy import ndimage
 from skimage.transform import downscale_local_mean
 
-from ..core.arrays import as_float
+from ..core.arrays import as_float, as_half
 from ..core.camera import Camera
 from ..core.color import display
 from .frames import MOST_KEPT
@@ -86,7 +87,13 @@ class Photographs:
         view, (x, y, *_) = self.views[i], self._windows[i]
         left, top, width, height = part = _tile(self.window, turn, spp)
         images, prior = self._planes(i, part)
-        planes, depth = ([as_float(p.ravel()) for p in parts] for parts in (images, prior))
+        floats, n = as_half(images), width * height
+        planes = [
+            mi.Float(dr.gather(mi.Float16, floats, dr.arange(mi.UInt32, n) + dr.opaque(mi.UInt32, k * n)))
+            for k in range(len(images))
+        ]
+        dr.eval(planes)
+        depth = [as_float(p.ravel()) for p in prior]
         behind = mi.Color3f(*planes[4:] or [self.background])
         size = self._size(view)
         return Photograph(

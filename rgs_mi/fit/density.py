@@ -31,12 +31,22 @@ class Statistics:
     def __init__(self, n: int) -> None:
         self.count, self.gradient, self.weight, self.share = (dr.zeros(mi.Float, n) for _ in range(4))
 
-    def add(self, gradient: "mi.Vector2f", contribution: "mi.Vector2f", seen: "mi.Bool", size: tuple[int, int]) -> None:
-        """Add a view of ``size`` (width, height) that listed the surfels ``seen``; ``gradient`` is that of the loss with
-        respect to the projected centers in pixels, one entry per surfel, and ``contribution`` are weight and share. What
-        overflowed counts as zero."""
+    def add(
+        self,
+        index: "mi.UInt32",
+        gradient: "mi.Vector2f",
+        contribution: "mi.Vector2f",
+        seen: "mi.Bool",
+        size: tuple[int, int],
+    ) -> None:
+        """Add a view of ``size`` (width, height) pixels. Of the surfels ``index``, none of them twice, it listed those ``seen``;
+        ``gradient`` is that of the loss with respect to their projected centers in pixels, and ``contribution`` are weight and
+        share. What overflowed counts as zero."""
         length = dr.norm(mi.Vector2f(gradient.x * (size[0] / 2), gradient.y * (size[1] / 2)))
-        self.merge([dr.select(seen & dr.isfinite(value), value, 0) for value in (mi.Float(1), length, *contribution)])
+        for total, value in zip(self.sums(), (mi.Float(1), length, *contribution)):
+            value = dr.select(seen & dr.isfinite(value), value, 0)
+            dr.scatter_reduce(dr.ReduceOp.Add, total, value, index, mode=dr.ReduceMode.NoConflicts)
+        dr.eval(self.sums())
 
     def sums(self) -> "list[mi.Float]":
         """Return all of them."""

@@ -1,5 +1,6 @@
 """What a fit learns: surfels, environment and shader in unconstrained form, and the optimizer that moves them."""
 
+import functools
 from collections.abc import Sequence
 
 import drjit as dr
@@ -7,10 +8,15 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.arrays import as_float, as_tensor
+from ..core.camera import Camera
 from ..shading.environment import Environment
 from ..shading.room import SIDES, Room
 from ..shading.shader import Shader, initial_weights
-from ..surfels.surfels import SH_0, Surfels
+from ..splat.intersect import in_view
+from ..splat.project import project
+from ..splat.tiles import Cutoffs
+from ..surfels.surfels import SH_0, SurfelColumns, Surfels
+from .rows import EPSILON, Rows
 
 #: Unconstrained parameters, one row per surfel.
 SURFEL_PARAMETERS = (
@@ -27,8 +33,6 @@ SURFEL_PARAMETERS = (
     "curvature",
 )
 ENVIRONMENT, SHADER, ROOM, SPECULAR = "log_environment", "shader", "log_nearness", "logit_specular"
-#: The step of 3DGS's optimizers is relative to the gradient's own size, however small.
-_EPSILON = 1e-15
 _LOG_RADIANCE = (-9.0, 8.0)  # texels that no ray tells apart would else drift to overflow
 _LEAST_SCALE = 1e-6  # world units: smaller surfels overflow on the screen
 
@@ -44,7 +48,7 @@ def _sigmoid(x):
 
 
 class Model:
-    """Surfels, environment and shader as Adam sees them.
+    """Surfels, environment and shader as Adam sees them: ``rows`` are the surfels', ``optimizer`` has all else.
 
     ``parameters`` are NumPy arrays [N, channels] named as `SURFEL_PARAMETERS`, `ENVIRONMENT` [rows, columns, 3], the
     logarithm of radiance, `SHADER` [weights], unless f_φ is the identity, `ROOM` [6], the logarithm of how near the walls
@@ -62,9 +66,13 @@ class Model:
     ) -> None:
         self.rotation, self.two_sided = np.asarray(rotation, np.float64), bool(two_sided)
         self.center = np.asarray(center, np.float64)
-        self.optimizer = mi.ad.Adam(lr=1e-3, epsilon=_EPSILON)
-        for name, value in parameters.items():
-            self.optimizer[name] = as_tensor(value)
+        self.rows = Rows({name: parameters[name] for name in SURFEL_PARAMETERS})
+        self.optimizer = mi.ad.Adam(lr=1e-3, epsilon=EPSILON)
+        for name in parameters.keys() - set(SURFEL_PARAMETERS):
+            self.optimizer[name] = as_tensor(parameters[name])
+        self._taken: list[
+            tuple[mi.UInt32, mi.Float, bool]
+        ] = []  # rows that a step has asked for: which, and whether each once
 
     @classmethod
     def start(
@@ -134,32 +142,84 @@ class Model:
         )
 
     def __len__(self) -> int:
-        return self.optimizer["centers"].shape[0]
+        return len(self.rows)
 
     def __getitem__(self, name: str) -> "mi.TensorXf":
+        """Return the parameter ``name``, which is none of the surfels'; differentiable."""
         return self.optimizer[name]
 
+    def names(self) -> list[str]:
+        """Return the names of all parameters."""
+        return [*self.rows.names(), *self.optimizer.keys()]
+
+    # ---- Surfels ----
+
     def surfels(self, sh_order: int) -> Surfels:
-        """Return the surfels, with spherical harmonics up to ``sh_order``; differentiable."""
-        p = self.optimizer
-        sh, rest, used = p["sh_dc"], p["sh_rest"], 3 * ((sh_order + 1) ** 2 - 1)
-        if used:
-            # a slice of all of it would be a copy, and another one in the derivative
-            sh = dr.concat((sh, rest if used == rest.shape[1] else rest[:, :used]), axis=1)
-        scales = dr.maximum(dr.exp(p["log_scales"]), _LEAST_SCALE)
-        return Surfels(
-            p["centers"],
-            p["rotations"],
-            scales,
-            _sigmoid(p["logit_opacities"]),
-            sh,
-            _sigmoid(p["logit_base_color"]),
-            _sigmoid(p["logit_roughness"]),
-            _sigmoid(p["logit_metallic"]),
-            p["delta_normal"],
-            p["curvature"],
-            self.two_sided,
-        )
+        """Return the surfels as they are by now, with spherical harmonics up to ``sh_order``; not differentiated."""
+        with dr.suspend_grad():
+            n, row, fields = len(self), dr.arange(mi.UInt32, len(self)), {}
+            for name, field in self._columns(self.rows.at(row), sh_order).items():
+                flat = dr.empty(mi.Float, n * len(field))
+                for k, column in enumerate(field):
+                    dr.scatter(flat, column, row * len(field) + k)
+                fields[name] = mi.TensorXf(flat, (n, len(field)))
+            dr.eval(fields)
+        return Surfels(**fields, two_sided=self.two_sided)
+
+    def scene(self, sh_order: int) -> SurfelColumns:
+        """Return all surfels as a step meets some of them: `take` returns those that are asked for, whose gradients `gradients`
+        then has."""
+        return _Scene(self, sh_order)
+
+    def in_view(self, camera: Camera, cutoffs: Cutoffs) -> "mi.UInt32":
+        """Return which surfels ``camera`` sees, as far as none hides another, in their order; the first where it sees none."""
+        with dr.suspend_grad():
+            columns = self._columns(self.rows.values, 0) | {"curvature": [mi.Float(0)] * 3}
+            index = dr.compress(in_view(project(SurfelColumns(columns, self.two_sided), camera), camera.size, cutoffs))
+        return index if dr.width(index) else dr.zeros(mi.UInt32, 1)
+
+    def take(self, index: "mi.UInt32", sh_order: int, once: bool) -> SurfelColumns:
+        """Return the surfels ``index``, with spherical harmonics up to ``sh_order``; differentiable: `gradients` has the
+        derivatives of what is computed of them. ``once`` says that none is there twice."""
+        rows = self.rows.at(index)
+        dr.enable_grad(rows)
+        if dr.grad_enabled(rows):
+            self._taken.append((index, rows, once))
+        return SurfelColumns(self._columns(rows, sh_order), self.two_sided, index)
+
+    def _columns(self, rows, sh_order):
+        """The fields of surfels, column by column, from ``rows`` of what is learned of them."""
+        p, more = self.rows.split(rows), 3 * ((sh_order + 1) ** 2 - 1)
+        return {
+            "centers": p["centers"],
+            "rotations": p["rotations"],
+            "scales": [dr.maximum(dr.exp(v), _LEAST_SCALE) for v in p["log_scales"]],
+            "opacities": [_sigmoid(v) for v in p["logit_opacities"]],
+            "sh": p["sh_dc"] + p["sh_rest"][:more],
+            "base_color": [_sigmoid(v) for v in p["logit_base_color"]],
+            "roughness": [_sigmoid(v) for v in p["logit_roughness"]],
+            "metallic": [_sigmoid(v) for v in p["logit_metallic"]],
+            "delta_normal": p["delta_normal"],
+            "curvature": p["curvature"],
+        }
+
+    # ---- Steps ----
+
+    def gradients(self, every: bool = False) -> "tuple[mi.UInt32, mi.Float]":
+        """Return (index, gradient) of the surfels that were taken since the last call, or of ``every`` one, as `step` wants
+        them."""
+        taken, self._taken = self._taken, []
+        return self.rows.together([(index, dr.grad(rows), once) for index, rows, once in taken], every)
+
+    def set_rates(self, rates: dict[str, float]) -> None:
+        """Set the learning rate of each of the parameters `names`."""
+        self.rows.rates = {name: rates[name] for name in self.rows.names()}
+        self.optimizer.set_learning_rate({name: rates[name] for name in self.optimizer.keys()})
+
+    def step(self, index: "mi.UInt32", gradient: "mi.Float") -> None:
+        """Move the surfels ``index`` by the ``gradient`` of their rows, and all else by what it has."""
+        self.rows.step(index, gradient)
+        self.optimizer.step()
 
     def environment(self) -> Environment:
         """Return the environment, non-negative by construction; differentiable."""
@@ -179,10 +239,14 @@ class Model:
 
     def numpy(self, name: str) -> np.ndarray:
         """Return the parameter ``name`` as a NumPy array, detached."""
-        return dr.detach(self.optimizer[name]).numpy()
+        return self.rows.numpy(name) if name in SURFEL_PARAMETERS else dr.detach(self.optimizer[name]).numpy()
 
     def set(self, name: str, value: np.ndarray, reset: bool = True) -> None:
-        """Replace the parameter ``name``; its moments start again from zero, or stay where ``reset`` is off (same shape)."""
+        """Replace the parameter ``name``; its moments start again from zero, or stay where ``reset`` is off. Its shape must stay,
+        where it is one of the surfels' or keeps its moments."""
+        if name in SURFEL_PARAMETERS:
+            self.rows.set(name, value, *(0 if reset else self.rows.numpy(name, of) for of in ("m", "v")))
+            return
         moments = self.optimizer.state[name][3]
         del self.optimizer[name]
         self.optimizer[name] = as_tensor(value)
@@ -193,12 +257,7 @@ class Model:
         """Keep the surfels ``index`` (any order, repeats allowed) with their moments, then overwrite parameters by
         ``changes`` {name: array}. Surfels that ``fresh`` marks get zero moments."""
         fresh = changes.pop("fresh", np.zeros(len(index), bool))
-        for name in SURFEL_PARAMETERS:
-            value = self.numpy(name)
-            t, m, v, _ = self.optimizer.state[name][3]
-            moments = [x.numpy().reshape(value.shape)[index] * ~fresh[:, None] for x in (m, v)]
-            self.set(name, changes.get(name, value[index]))
-            self._set_moments(name, t, *map(as_float, moments))
+        self.rows.select(index, changes, fresh)
 
     def refine_environment(self) -> None:
         """Give the environment twice as many rows and columns, on which the logarithm of radiance and its moments are as
@@ -219,6 +278,7 @@ class Model:
     def state(self) -> dict[str, np.ndarray]:
         """Return everything that a checkpoint needs, as NumPy arrays."""
         arrays = {"rotation": self.rotation, "two_sided": np.array(self.two_sided), "center": self.center}
+        arrays |= self.rows.state()
         for name in self.optimizer.keys():
             t, m, v, _ = self.optimizer.state[name][3]
             arrays |= {
@@ -235,6 +295,30 @@ class Model:
         names = [name for name in (*SURFEL_PARAMETERS, ENVIRONMENT, SHADER, ROOM, SPECULAR) if name in arrays]
         parameters = {name: arrays[name] for name in names}
         model = cls(parameters, arrays["rotation"], bool(arrays["two_sided"]), arrays.get("center", (0, 0, 0)))
-        for name in names:
+        model.rows = Rows.from_state(arrays, SURFEL_PARAMETERS)
+        for name in model.optimizer.keys():
             model._set_moments(name, mi.UInt32(int(arrays[f"{name}.t"])), *(as_float(arrays[f"{name}.{k}"]) for k in "mv"))
         return model
+
+
+class _Scene(SurfelColumns):
+    """The surfels of a model, which are read as a whole only where someone asks for that, and then are not differentiated."""
+
+    def __init__(self, model: Model, sh_order: int) -> None:
+        self._model, self._sh_order, self.two_sided = model, sh_order, model.two_sided
+
+    @functools.cached_property
+    def _whole(self):
+        return self._model.surfels(self._sh_order)
+
+    def __len__(self) -> int:
+        return len(self._model)
+
+    def channels(self, name: str) -> int:
+        return self._whole.channels(name)
+
+    def _column(self, name, k):
+        return self._whole._column(name, k)
+
+    def take(self, index: "mi.UInt32") -> SurfelColumns:
+        return self._model.take(index, self._sh_order, once=False)

@@ -15,7 +15,7 @@ from ..shading import deferred
 from ..shading.lighting import Lighting
 from ..splat.gbuffer import GBuffer
 from ..splat.tiles import Cutoffs
-from ..surfels.surfels import CHANNELS, Surfels
+from ..surfels.surfels import CHANNELS, SurfelColumns
 from . import losses
 from .reflection_guided import reflective_mask
 
@@ -106,13 +106,14 @@ class Objective:
             terms["depth"] = w.depth * losses.pearson_depth(depth, photo.prior, covered, photo.inverse)
         return terms, mask
 
-    def residual(self, surfels: Surfels, lighting: Lighting, camera: Camera) -> "mi.Float":
+    def residual(self, surfels: SurfelColumns, lighting: Lighting, camera: Camera) -> "mi.Float":
         """Return the weighted part of the ``surfels``' diffuse radiance, as ``camera`` sees them, that is not what their base
         color reflects under ``lighting``; of width 1. It has gradients in the base color alone, on which nothing depends that
         photographs show of what is no metal."""
-        held = {name: dr.detach(getattr(surfels, name)) for name in CHANNELS if name != "base_color"}
-        surfels = replace(surfels, **held).split()
-        lighting = lighting.with_learned([dr.detach(v) for v in lighting.learned()], surfels)
+        surfels = surfels.with_columns(
+            {name: dr.detach(surfels.all_columns(name)) for name in CHANNELS if name != "base_color"}
+        )
+        lighting = lighting.with_learned([dr.detach(v) for v in lighting.learned()])
         center = surfels.column(mi.Point3f, "centers")
         view = dr.normalize(opaque(camera, len(surfels)).origin - center)
         scales, opacity = surfels.column(mi.Vector2f, "scales"), surfels.column(mi.Float, "opacities")

@@ -17,7 +17,7 @@ from ..shading import deferred
 from ..shading.lighting import Lighting, Shading, lighting_of
 from ..shading.tables import eta_of
 from ..surfels.proxies import Proxies
-from ..surfels.surfels import CHANNELS, Surfels
+from ..surfels.surfels import SurfelColumns
 from . import light_maps, losses, reflection_guided
 from .cameras import Cameras, mean_rows
 from .curves import Curves
@@ -179,7 +179,7 @@ class Fit:
 
     # ---- Lighting ----
 
-    def lighting(self, surfels: Surfels, training: bool = False) -> Lighting | None:
+    def lighting(self, surfels: SurfelColumns, training: bool = False) -> Lighting | None:
         """How the model's ``surfels`` are shaded by now; None where nothing is specular. ``training``: as a step has it,
         with what reflected rays meet, and the light's sampling, of some steps ago."""
         shading = self._shading_of_steps if training else self.shading
@@ -246,14 +246,14 @@ class Fit:
             release_memory()  # of arrays of sizes that do not come again
         self._follow_schedule()
         views = self._next_views(stage.views * self.ranks.size)[self.ranks.rank :: self.ranks.size]
-        surfels = self.model.surfels(self.sh_order)
+        surfels = self.model.scene(self.sh_order)
         self._refresh(surfels)
         lighting = self.lighting(surfels, training=True)
-        measured, reached = self._backward(views, surfels, lighting)
+        measured, reached, moved = self._backward(views, lighting)
         if reached and (loss := self.objective.environment(self.model[ENVIRONMENT])) is not None:
             dr.backward(loss * light_maps.STEPS)
             measured.append({"loss.environment_tv": dr.detach(loss)})
-        self.model.optimizer.step()
+        self.model.step(*moved)
         dr.eval(measured)
         mean = {name: np.mean([float(m[name][0]) for m in measured if name in m]) for m in measured for name in m}
         self._judge(mean.pop("error"))
@@ -273,13 +273,12 @@ class Fit:
 
     def _follow_schedule(self):
         """Bring rates, and rows of the environment, to where they should be by now."""
-        optimizer = self.model.optimizer
         height = self.schedule.envmap_height(self.progress, self.model[ENVIRONMENT].shape[0], self.pixels)
         while self.model[ENVIRONMENT].shape[0] < height:
             self.model.refine_environment()
-        rates = self.schedule.learning_rates(optimizer.keys(), self.progress, self.extent, self.model.two_sided)
+        rates = self.schedule.learning_rates(self.model.names(), self.progress, self.extent, self.model.two_sided)
         longer = np.sqrt(self.ranks.size)  # what more views agree on has less noise (Adam: Malladi et al. 2022)
-        optimizer.set_learning_rate({name: longer * rate for name, rate in rates.items()})
+        self.model.set_rates({name: longer * rate for name, rate in rates.items()})
 
     def _next_views(self, count):
         """Views of the next step: random orders of all, one after another, that depend on seed and position alone."""
@@ -291,43 +290,39 @@ class Fit:
         self.views_used += count
         return chosen
 
-    def _backward(self, views, surfels, lighting):
+    def _backward(self, views, lighting):
         """Gradients of the mean loss of ``views``; returns what each of them measured, their mean squared ``error`` in all
-        processes, and whether the gradients of the last steps have reached the environment."""
-        # The views share what lies before them: their gradients meet in leaves there, and go the rest of the way once.
-        shared = [*(getattr(surfels, name) for name in CHANNELS), *(lighting.learned() if lighting else [])]
+        processes, whether the gradients of the last steps have reached the environment, and what `Model.step` is to move."""
+        # The views share what lies before the light: their gradients meet in leaves there, and go the rest of the way once.
+        shared = lighting.learned() if lighting else []
         leaves = [type(v)(dr.detach(v)) for v in shared]
         dr.eval(leaves)
         dr.enable_grad(leaves)
-        surfels = Surfels(**dict(zip(CHANNELS, leaves)), two_sided=surfels.two_sided)
-        lighting = lighting and lighting.with_learned(leaves[len(CHANNELS) :], surfels)
+        lighting = lighting and lighting.with_learned(leaves)
         statistics = Statistics(len(self.model))
-        measured = [self._view(i, surfels, lighting, 1 / len(views), statistics) for i in views]
+        measured = [self._view(i, lighting, 1 / len(views), statistics) for i in views]
         error = dr.mean([m.pop("error") for m in measured])
-        if lighting and self.schedule.explains(self.progress):
-            loss = self.objective.residual(surfels, lighting, self.dataset.train[views[0]].camera)
-            dr.backward(loss)
-            measured.append({"loss.residual": dr.detach(loss)})
+        index, gradient = self.model.gradients(every=self.ranks.size > 1)
         gradients = [dr.grad(leaf) for leaf in leaves]
         gradients = [dr.select(dr.isfinite(g), g, 0) for g in gradients]  # one overflow must not end a fit
         light = None
         if lighting:  # whose maps come first of what it learns
-            del shared[len(CHANNELS)]
-            light = self._light.gather(self.step_number, gradients.pop(len(CHANNELS)))
+            del shared[0]
+            light = self._light.gather(self.step_number, gradients.pop(0))
         sums = statistics.sums()
-        *means, error, light = self.ranks.mean([*gradients, *sums, error, light])
+        gradient, *means, error, light = self.ranks.mean([gradient, *gradients, *sums, error, light])
         gradients, sums = means[: -len(sums)], means[-len(sums) :]
         self.density.statistics.merge([mean * self.ranks.size for mean in sums])
         measured.append({"error": error})
         if light is not None:
             self._light.pass_on(self.model, light)
-        for value, gradient in zip(shared, gradients):
-            dr.set_grad(value, gradient)
+        for value, own in zip(shared, gradients):
+            dr.set_grad(value, own)
             dr.enqueue(dr.ADMode.Backward, value)
         dr.traverse(dr.ADMode.Backward)
-        return measured, light is not None
+        return measured, light is not None, (index, gradient)
 
-    def _view(self, i, surfels, lighting, weight, statistics):
+    def _view(self, i, lighting, weight, statistics):
         """Accumulate the gradients of view ``i``, and density control's ``statistics``; returns its loss's terms and the mean
         squared ``error``."""
         assert self.photographs is not None
@@ -339,15 +334,19 @@ class Fit:
             photo, gain, terms = replace(photo, camera=seen.camera), seen.gain, {"loss.cameras": seen.prior}
         if self.turns and lighting:
             lighting = replace(lighting, turn=self.turns.see(photo.camera))
-        means2d_offset = dr.zeros(mi.Vector2f, len(self.model))
-        dr.enable_grad(means2d_offset)
-        contribution = dr.zeros(mi.Vector2f, len(self.model)) if self.density.weighs else None
-        dr.enable_grad(contribution)
         camera = film.samples(photo.camera)
+        index = self.model.in_view(camera, CUTOFFS)
+        surfels = self.model.take(index, self.sh_order, once=True)
+        means2d_offset = dr.zeros(mi.Vector2f, len(surfels))
+        dr.enable_grad(means2d_offset)
+        contribution = dr.zeros(mi.Vector2f, len(surfels)) if self.density.weighs else None
+        dr.enable_grad(contribution)
         image = deferred.render(surfels, camera, lighting, means2d_offset, CUTOFFS, self.objective.full, contribution)
         consistency = self.schedule.value(self.settings.weights.consistency, self.progress)
         loss = self.objective(image, photo, self.dataset.train[i].masked, consistency, self.step_number, gain, film)
         terms |= loss.terms
+        if lighting and self.schedule.explains(self.progress):
+            terms["loss.residual"] = self.objective.residual(surfels, lighting, self.dataset.train[i].camera)
         total = sum(terms.values()) * weight
         if (weighed := image.gbuffer.all.contribution) is not None:
             total += dr.mean(weighed.x + weighed.y * loss.photometric)
@@ -355,7 +354,7 @@ class Fit:
         gradient = dr.grad(means2d_offset) * (photo.part / weight)  # as if all of the window had been seen
         found = mi.Vector2f(0) if contribution is None else dr.grad(contribution)
         size = tuple(film.side * n for n in photo.size)  # of which the gradient is
-        statistics.add(gradient, found, image.gbuffer.seen, size)
+        statistics.add(index, gradient, found, image.gbuffer.seen, size)
         if loss.reflective is not None:
             self.density.note_reflective(i, camera, loss.reflective)
         return dr.detach(terms) | {"error": loss.error}

@@ -223,7 +223,7 @@ def _facts(fit) -> dict:
         "train_seconds": fit.elapsed,
         "iterations": fit.step_number,
         "surfels": len(fit.model),
-        "parameters": sum(fit.model.numpy(name).size for name in fit.model.optimizer.keys()),
+        "parameters": sum(fit.model.numpy(name).size for name in fit.model.names()),
         "peak_rss_mb": peak_rss_mb(),
         "train_views": len(fit.dataset.train),
         "test_views": len(fit.dataset.test),

@@ -10,7 +10,7 @@ from ..core.camera import Camera, opaque, pixel_directions
 from ..core.turntable import Turntable
 from ..splat.gbuffer import GBuffer, render_gbuffer
 from ..splat.tiles import Cutoffs
-from ..surfels.surfels import Surfels
+from ..surfels.surfels import SurfelColumns
 from .environment import FilteredEnvironment
 from .lighting import Lighting
 from .surface import Surface
@@ -84,7 +84,7 @@ def _reflected(gbuffer, camera, lighting):
 
 
 def render(
-    surfels: Surfels,
+    surfels: SurfelColumns,
     camera: Camera,
     lighting: Lighting | None,
     means2d_offset: "mi.Vector2f | None" = None,

@@ -25,7 +25,7 @@ import numpy as np
 
 from ..core.bounding_box import BoundingBox
 from ..surfels.proxies import Proxies
-from ..surfels.surfels import SH_0, Surfels
+from ..surfels.surfels import SH_0, SurfelColumns
 from .sequence import points
 
 if TYPE_CHECKING:
@@ -43,13 +43,13 @@ class Indirect:
 
     kind                   what a ray brings from a surfel that it meets: nothing, or that surfel's radiance
     proxies                the quads that rays meet, perhaps of a few steps ago
-    surfels                the surfels as they are
+    surfels                the surfels as they are, all that rays may meet
     irradiance_visibility  a of (9), one entry per surfel (None: 1 for all)
     """
 
     kind: Literal["visibility", "one_bounce"]
     proxies: Proxies
-    surfels: Surfels
+    surfels: SurfelColumns
     irradiance_visibility: "mi.Color3f | None" = None
 
     def incident_radiance(
@@ -110,17 +110,24 @@ class Indirect:
             dr.eval(coming, radiance)
         return coming / dr.maximum(radiance, 1e-6)
 
-    def with_visibility_as_radiance(self, surfels: Surfels, box: BoundingBox | None) -> Surfels:
+    def with_visibility_as_radiance(self, surfels: SurfelColumns, box: BoundingBox | None) -> SurfelColumns:
         """Return ``surfels`` whose radiance is their `irradiance_visibility`, in the ``box`` (None: everywhere), to be
         splatted. That must be known."""
-        visibility = self.irradiance_visibility
+        visibility, surfels = self.visibility_of(surfels), surfels.split()
         assert visibility is not None, "with_irradiance_visibility() comes first"
-        shape = surfels.sh.shape
-        sh, row = dr.copy(surfels.sh.array), dr.arange(mi.UInt32, len(surfels)) * shape[1]
-        inside = mi.Bool(True) if box is None else box.contains(surfels.column(mi.Point3f, "centers"))
-        for k in range(shape[1]):
-            dr.scatter(sh, (visibility[k] - 0.5) / SH_0 if k < 3 else mi.Float(0), row + k, inside)
-        return replace(surfels, sh=mi.TensorXf(sh, shape))
+        sh = [(part - 0.5) / SH_0 for part in visibility]
+        if box is not None:
+            inside = box.contains(surfels.column(mi.Point3f, "centers"))
+            own = surfels.all_columns("sh")
+            sh += [mi.Float(0)] * (len(own) - len(sh))
+            sh = [dr.select(inside, a, b) for a, b in zip(sh, own)]
+        return surfels.with_columns({"sh": sh})
+
+    def visibility_of(self, surfels: SurfelColumns) -> "mi.Color3f | None":
+        """Return the `irradiance_visibility` of some ``surfels`` of the scene."""
+        visibility = self.irradiance_visibility
+        known = visibility is not None and surfels.index is not None
+        return dr.gather(mi.Color3f, visibility, surfels.index) if known else visibility
 
     def _radiance(self, index, uv, direction, lighting):
         """What the surfels ``index`` send against ``direction`` from ``uv`` on them; they in turn reflect the environment

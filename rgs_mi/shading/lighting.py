@@ -10,7 +10,7 @@ from ..core.bounding_box import BoundingBox
 from ..core.camera import Camera
 from ..core.turntable import Turntable
 from ..surfels.proxies import Proxies
-from ..surfels.surfels import Surfels
+from ..surfels.surfels import SurfelColumns
 from .environment import FilteredEnvironment, IncidentRadiance
 from .indirect import Indirect
 from .monte_carlo import SAMPLES, MonteCarlo
@@ -89,7 +89,7 @@ class Lighting:
 
     def radiance(
         self,
-        surfels: Surfels,
+        surfels: SurfelColumns,
         uv: "mi.Point2f",
         view: "mi.Vector3f",
         irradiance_visibility: "mi.Color3f | float" = 1,
@@ -127,10 +127,10 @@ class Lighting:
             point if self.near else None,
         )
 
-    def lit_radiance(self, surfels: Surfels, view: "mi.Vector3f") -> "mi.Color3f":
+    def lit_radiance(self, surfels: SurfelColumns, view: "mi.Vector3f") -> "mi.Color3f":
         """Return the diffuse radiance that each of the ``surfels`` would send along its unit ``view``, in world space, if it were
         lit: what its base color reflects of the light."""
-        visibility = None if self.indirect is None else self.indirect.irradiance_visibility
+        visibility = None if self.indirect is None else self.indirect.visibility_of(surfels)
         return self.estimator.diffuse(self._surface(surfels, view), None, 1 if visibility is None else visibility)
 
     def _incident_radiance(self, surface) -> IncidentRadiance | None:
@@ -158,7 +158,7 @@ class Lighting:
         assert self.indirect is not None, "nothing hides light where surfels do not reflect each other"
         return replace(self, indirect=self.indirect.with_irradiance_visibility(self, dr.opaque(mi.UInt32, seed)))
 
-    def as_splatted(self, surfels: Surfels) -> Surfels:
+    def as_splatted(self, surfels: SurfelColumns) -> SurfelColumns:
         """Return the surfels to splat: what is lit has no radiance of its own, but its irradiance visibility in its place."""
         indirect = self._with_visibility
         return surfels if indirect is None else indirect.with_visibility_as_radiance(surfels, self.box)
@@ -176,19 +176,15 @@ class Lighting:
         weights of the shader where there is one."""
         return [*self.estimator.learned(), *([self.shader.weights] if self.shader else [])]
 
-    def with_learned(self, arrays: list, surfels: Surfels) -> "Lighting":
-        """Return the same lighting with other ``arrays`` in place of `learned`, and for other ``surfels``, moved ones."""
-        return replace(
-            self,
-            estimator=self.estimator.with_learned(arrays),
-            shader=self.shader and Shader(arrays[-1]),
-            indirect=self.indirect and replace(self.indirect, surfels=surfels),
-        )
+    def with_learned(self, arrays: list) -> "Lighting":
+        """Return the same lighting with other ``arrays`` in place of `learned`."""
+        shader = self.shader and Shader(arrays[-1])
+        return replace(self, estimator=self.estimator.with_learned(arrays), shader=shader)
 
 
 def lighting_of(
     shading: Shading,
-    surfels: Surfels,
+    surfels: SurfelColumns,
     environment: FilteredEnvironment | None,
     emitter: "mi.Emitter | None" = None,
     shader: Shader | None = None,

@@ -9,13 +9,13 @@ import mitsuba as mi
 
 from ..core.camera import Camera
 from .composite import Layout, composite
-from .hit import PACKET, fetch
+from .hit import PACKET, FetchAll, fetch
 from .intersect import isect_tiles
 from .project import project
 from .tiles import Cutoffs
 
 if TYPE_CHECKING:
-    from ..surfels.surfels import Surfels
+    from ..surfels.surfels import SurfelColumns
 
 
 @dataclass
@@ -88,34 +88,15 @@ class GBuffer:
         )
 
 
-class _Planes(dr.CustomOp):
-    """The floats of all pixels, of an image with so many floats a pixel. Each is read once, so that the adjoint writes where that
-    of a plain gather would add atomically."""
-
-    def eval(self, image, stride):
-        self.stride, self.count = stride, dr.width(image) // stride
-        return self._fetch(image)
-
-    def _fetch(self, image):
-        return fetch(image, dr.arange(mi.UInt32, self.count), self.stride)
-
-    def forward(self):
-        self.set_grad_out(self._fetch(self.grad_in("image")))
-
-    def backward(self):
-        adjoint = list(self.grad_out())
-        dr.eval(adjoint)  # otherwise every scatter below would compute them again
-        image, row = dr.empty(mi.Float, self.count * self.stride), dr.arange(mi.UInt32, self.count) * (self.stride // PACKET)
-        for q in range(self.stride // PACKET):
-            dr.scatter(image, mi.Vector4f(*adjoint[PACKET * q : PACKET * (q + 1)]), row + q)
-        self.set_grad_in("image", image)
+class _Planes(FetchAll):
+    """The floats of all pixels, of an image with so many floats a pixel."""
 
     def name(self):
         return "rgs_mi.splat.Planes"
 
 
 def render_gbuffer(
-    surfels: "Surfels",
+    surfels: "SurfelColumns",
     camera: Camera,
     means2d_offset: "mi.Vector2f | None" = None,
     cutoffs: Cutoffs = Cutoffs(),

@@ -48,6 +48,38 @@ def fetch(buffer: "mi.Float", row: "mi.UInt32", stride: int, active: "mi.Bool | 
     return floats
 
 
+def reach(geometry: "Sequence[mi.Float]", cutoffs: Cutoffs) -> "mi.Float":
+    """Return the squared distance, in standard deviations, within which surfels of this ``geometry`` have an α above the cut-off,
+    or a little more."""
+    return 2 * dr.log(geometry[-1] / cutoffs.alpha_min) + _SLACK
+
+
+class FetchAll(dr.CustomOp):
+    """The custom operation from a buffer to the floats of all of its rows, so many a row. Each is read once, so that the adjoint
+    writes where that of a plain gather would add atomically."""
+
+    def eval(self, buffer: "mi.Float", stride: int) -> "list[mi.Float]":
+        self.stride, self.count = stride, dr.width(buffer) // stride
+        return self._fetch(buffer)
+
+    def _fetch(self, buffer):
+        return fetch(buffer, dr.arange(mi.UInt32, self.count), self.stride)
+
+    def forward(self) -> None:
+        self.set_grad_out(self._fetch(self.grad_in("buffer")))
+
+    def backward(self) -> None:
+        adjoint = list(self.grad_out())
+        dr.eval(adjoint)  # otherwise every scatter below would compute them again
+        buffer, row = (
+            dr.empty(mi.Float, self.count * self.stride),
+            dr.arange(mi.UInt32, self.count) * (self.stride // PACKET),
+        )
+        for q in range(self.stride // PACKET):
+            dr.scatter(buffer, mi.Vector4f(*adjoint[PACKET * q : PACKET * (q + 1)]), row + q)
+        self.set_grad_in("buffer", buffer)
+
+
 class Hit:
     """One pixel, at (x, y), against one projected Gaussian, a row of `pack`: equation (1) of `project.py` and the weight of
     (2) of `composite.py`.
@@ -75,20 +107,21 @@ class Hit:
         self.alpha = dr.select(self.kept, dr.minimum(alpha, cutoffs.alpha_max), 0)
         self.t = dr.select(self.on_plane, z * self.inv_h, z)
 
-    def in_block(self, gaussian: "Sequence[mi.Float]", cutoffs: Cutoffs) -> "tuple[mi.Float, mi.Bool, list[mi.Float]]":
+    def in_block(
+        self, gaussian: "Sequence[mi.Float]", reach: "mi.Float", cutoffs: Cutoffs
+    ) -> "tuple[mi.Float, mi.Bool, list[mi.Float]]":
         """Return what this hit, in the middle of a block's pixels, says of these: the depth t; whether any of them can see the
-        surfel, α being above the cut-off; and at least how much of the light behind it hides from each of them. u and v are
+        surfel, being within its `reach`; and at least how much of the light behind it hides from each of them. u and v are
         taken times h to spare the divisions, and exp(−ρ/2) is at least (1 − ρ/8)⁴."""
         _, _, A_x, A_y, B_x, B_y, N_x, N_y, _, opacity = gaussian[: len(GEOMETRY)]
-        limit = 2 * dr.log(opacity / cutoffs.alpha_min) + _SLACK
         most, seen, alphas = dr.minimum(opacity, cutoffs.alpha_max), mi.Bool(False), []
         eighth = self.inv_h * self.inv_h / 8
         for x, y in itertools.product(*((k - 0.5 * (n - 1) for k in range(n)) for n in BLOCK)):
             dx, dy = self.dx + x, self.dy + y
             h, u, v = (offset + a * dx + b * dy for offset, a, b in ((1, N_x, N_y), (0, A_x, A_y), (0, B_x, B_y)))
             rho = u * u + v * v
-            near = (h > HORIZON) & (rho < limit * h * h)
-            seen |= near | (LOW_PASS * (dx * dx + dy * dy) < limit)
+            near = (h > HORIZON) & (rho < reach * h * h)
+            seen |= near | (LOW_PASS * (dx * dx + dy * dy) < reach)
             alphas.append(dr.select(near, most * dr.square(dr.square(dr.maximum(1 - eighth * rho, 0))), 0))
         return self.t, seen, alphas
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .hit import Hit, fetch, pack, padded
+from .hit import Hit, fetch, pack, padded, reach
 from .project import Projected
 from .tiles import BLOCK, LOW_PASS, TILE, Cutoffs, block_pixels, tile_grid
 
@@ -35,6 +35,17 @@ class TileIntersections:
     first: "mi.UInt32"
     count: "mi.UInt32"
     seen: "mi.Bool"
+
+
+@dataclass
+class _Unsorted:
+    """What each block sees, not in its order yet: ``entries`` are pairs of the depth at which its middle meets a surfel and of
+    that surfel's index, in the bits of a float (one packet of two is read and written faster than two numbers); ``first`` and
+    ``count`` each block's range of these pairs."""
+
+    entries: "mi.Float"
+    first: "mi.UInt32"
+    count: "mi.UInt32"
 
 
 @dataclass
@@ -116,27 +127,39 @@ def isect_tiles(projected: Projected, size: tuple[int, int], cutoffs: Cutoffs) -
     them; blocks are in the order of `block_pixels`. Not differentiated."""
     with dr.suspend_grad():
         tiles = _tile_intersections(projected, size, cutoffs.alpha_min)
-        return _sorted(*_seen_by_blocks(projected, size, tiles, cutoffs), cutoffs)
+        return _sorted(_seen_by_blocks(projected, size, tiles, cutoffs), tiles.seen, cutoffs)
+
+
+def in_view(projected: Projected, size: tuple[int, int], cutoffs: Cutoffs) -> "mi.Bool":
+    """Return which surfels an image of ``size`` (width, height) pixels shows, or one that is larger by a tile on each side, as
+    far as no surfel hides another. Not differentiated."""
+    with dr.suspend_grad():
+        outline, drawn = _outline(projected.geometry, cutoffs.alpha_min)
+        for n, margin, e, h, center in zip(
+            size, TILE, (outline.ex, outline.ey), (outline.hx, outline.hy), (outline.x, outline.y)
+        ):
+            drawn &= dr.maximum(e + h, center + outline.r) > -margin
+            drawn &= dr.minimum(e - h, center - outline.r) < n + margin
+        return drawn & projected.visible
 
 
 def _seen_by_blocks(projected, size, tiles, cutoffs):
-    """(`TileIntersections` of blocks, in the order of their tiles; the depths at which their middles meet these surfels). Lists
-    end where nothing behind can be seen any more, or a little later."""
+    """`_Unsorted` lists of blocks, in the order of their tiles. They end where nothing behind can be seen any more, or a little
+    later."""
     tile, pixels = block_pixels(size)
     first, count = (dr.gather(mi.UInt32, values, tile) for values in (tiles.first, tiles.count))
     end, blocks = first + count, dr.width(tile) // dr.width(tiles.first)
     start = first * blocks + count * (dr.arange(mi.UInt32, dr.width(tile)) % blocks)  # room for the whole tile's list
     x, y = (mi.Float(corner) + 0.5 * n for corner, n in zip(pixels[0], BLOCK))
-    gaussians = pack(projected.geometry)
-    ids, depths = (dr.empty(kind, dr.width(tiles.ids) * blocks) for kind in (mi.UInt32, mi.Float))
+    gaussians = pack([*projected.geometry, reach(projected.geometry, cutoffs)])
+    entries = dr.empty(mi.Float, 2 * dr.width(tiles.ids) * blocks)
     dr.eval(gaussians, first, end, start, x, y)
 
     def step(i, at, T):
         surfel = dr.gather(mi.UInt32, tiles.ids, i)
-        gaussian = fetch(gaussians, surfel, padded(len(projected.geometry)))
-        depth, seen, alphas = Hit(gaussian, x, y, cutoffs).in_block(gaussian, cutoffs)
-        dr.scatter(ids, surfel, at, seen)
-        dr.scatter(depths, depth, at, seen)
+        *gaussian, farthest, _ = fetch(gaussians, surfel, padded(len(projected.geometry) + 1))
+        depth, seen, alphas = Hit(gaussian, x, y, cutoffs).in_block(gaussian, farthest, cutoffs)
+        dr.scatter(entries, mi.Vector2f(depth, dr.reinterpret_array(mi.Float, surfel)), at, seen)
         return i + 1, at + dr.select(seen, mi.UInt32(1), 0), [t - t * alpha for t, alpha in zip(T, alphas)]
 
     def alive(i, at, T):
@@ -144,24 +167,25 @@ def _seen_by_blocks(projected, size, tiles, cutoffs):
 
     past = dr.while_loop((first, start, [mi.Float(1) for _ in pixels]), alive, step, label="list")[1]
     count = past - start
-    dr.eval(ids, depths, count)
-    return TileIntersections(ids, start, count, tiles.seen), depths
+    dr.eval(entries, count)
+    return _Unsorted(entries, start, count)
 
 
-def _sorted(lists, keys, cutoffs) -> TileIntersections:
-    """The ``lists`` of blocks in the order of their ``keys``, but for surfels that are farther than a queue from their place."""
+def _sorted(lists, seen, cutoffs) -> TileIntersections:
+    """The ``lists`` of blocks in the order of their depths, but for surfels that are farther than a queue from their place;
+    ``seen`` is that of the tiles."""
     first = dr.prefix_reduce(dr.ReduceOp.Add, lists.count, exclusive=True)
     total = int(first[-1] + lists.count[-1])
     if total == 0:
-        return lists
+        return TileIntersections(dr.zeros(mi.UInt32, 1), first, lists.count, seen)
     ids, length = dr.empty(mi.UInt32, total), cutoffs.resort_window
     stop = dr.select(lists.count > 0, lists.count + length, 0)
 
     def step(i, depths, surfels):
         # One surfel enters the queue, the nearest leaves it; "farther than all" drives the rest out in the end.
         listed = i < lists.count
-        surfel = dr.gather(mi.UInt32, lists.ids, lists.first + i, listed)
-        depth = dr.select(listed, dr.gather(mi.Float, keys, lists.first + i, listed), dr.inf)
+        depth, surfel = dr.gather(mi.Vector2f, lists.entries, lists.first + i, listed)
+        depth, surfel = dr.select(listed, depth, dr.inf), dr.reinterpret_array(mi.UInt32, surfel)
         for k in reversed(range(length)):
             nearer = depth < depths[k]
             depth, depths[k] = dr.minimum(depth, depths[k]), dr.maximum(depth, depths[k])
@@ -172,7 +196,7 @@ def _sorted(lists, keys, cutoffs) -> TileIntersections:
     state = mi.UInt32(0), [mi.Float(-dr.inf)] * length, [mi.UInt32(0)] * length
     dr.eval(dr.while_loop(state, lambda i, depths, surfels: i < stop, step, label="sort"))
     dr.eval(ids)
-    return TileIntersections(ids, first, lists.count, lists.seen)
+    return TileIntersections(ids, first, lists.count, seen)
 
 
 def _sort_key(tile, depth, tiles):

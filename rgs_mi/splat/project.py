@@ -22,7 +22,7 @@ import mitsuba as mi
 from ..core.camera import Camera, opaque
 
 if TYPE_CHECKING:
-    from ..surfels.surfels import Surfels
+    from ..surfels.surfels import SurfelColumns
 
 #: Names of the ten geometric numbers of a projected Gaussian.
 GEOMETRY = ("x", "y", "A_x", "A_y", "B_x", "B_y", "N_x", "N_y", "z", "opacity")
@@ -48,7 +48,7 @@ class Projected:
     visible: "mi.Bool"
 
 
-def project(surfels: "Surfels", camera: Camera, means2d_offset: "mi.Vector2f | None" = None) -> Projected:
+def project(surfels: "SurfelColumns", camera: Camera, means2d_offset: "mi.Vector2f | None" = None) -> Projected:
     """Project all N ``surfels`` into ``camera``; differentiable.
 
     ``means2d_offset`` (pixels, width N) is added to the projected centers: zeros with gradients enabled obtain the gradient

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.bounding_box import BoundingBox
-from .surfels import Surfels
+from .surfels import SurfelColumns
 
 _SOLID = 0.2  # a ray meets a surfel where it is at least this opaque
 _CLEARANCE = 2.0  # rays start that many standard deviations of a typical surfel above the surface
@@ -12,7 +12,7 @@ _CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 _TRIANGLES = (0, 1, 2, 0, 2, 3)
 
 
-def corners(surfels: Surfels, extent: "mi.Float") -> "list[mi.Point3f]":
+def corners(surfels: SurfelColumns, extent: "mi.Float") -> "list[mi.Point3f]":
     """Return the four corners of every surfel's quad in world space, each of width N; ``extent`` is half its width in
     standard deviations."""
     t_u, t_v, _ = surfels.frames()
@@ -42,7 +42,7 @@ class Proxies:
       clearance  how far above the surface rays start, world units, of width 1
     """
 
-    def __init__(self, surfels: Surfels, solid: float = _SOLID, box: BoundingBox | None = None) -> None:
+    def __init__(self, surfels: SurfelColumns, solid: float = _SOLID, box: BoundingBox | None = None) -> None:
         with dr.suspend_grad():
             opacity = surfels.column(mi.Float, "opacities")
             if box is not None:

@@ -4,7 +4,7 @@ A surfel is the primitive of 2DGS (Huang et al. 2024): a center, two tangents wi
 Its material has the names of Mitsuba's principled BSDF, so that a cloud of surfels is a principled material.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -27,87 +27,52 @@ CHANNELS = {
 SH_0 = 0.28209479  # the spherical harmonic of order 0
 
 
-@dataclass
-class Surfels:
-    """N surfels. Every field is a tensor of shape [N, channels] in its physical range.
+class SurfelColumns:
+    """N surfels, column by column, and what follows from these: the fields of `Surfels` by their names, a list of arrays of
+    width N each. ``index`` says which of a scene's surfels they are (None: all, in their order); ``two_sided`` is that of
+    `Surfels`."""
 
-    centers       positions, world space
-    rotations     unit quaternions (x, y, z, w), the order of Mitsuba and Dr.Jit, while 3DGS's PLY columns rot_0 … rot_3 are
-                  (w, x, y, z); the columns of their matrix are the tangents t_u, t_v and the normal, world space
-    scales        standard deviations along t_u and t_v, world units, > 0
-    opacities     in (0, 1)
-    sh            diffuse radiance, linear: max(0, 1/2 + Σ_k sh_k Y_k(d)), d from the camera to the center (3DGS)
-    base_color, roughness, metallic   principled BSDF parameters in [0, 1]
-    delta_normal  the residual Δn that is added to the normal (RGS), world space
-    curvature     K_uu, K_uv, K_vv: how the normal turns across the surfel, radians per √(s_u s_v); see `normal_derivatives`
-    two_sided     whether surfels show from behind, with the normal turned to the camera (2DGS); one-sided ones, whose
-                  normals point outwards, keep the far side of a closed object from bending its silhouette's normals
-    columns       the columns of all fields where `split` has read them, else None
-    """
+    two_sided: bool
+    index: "mi.UInt32 | None" = None
 
-    centers: "mi.TensorXf"
-    rotations: "mi.TensorXf"
-    scales: "mi.TensorXf"
-    opacities: "mi.TensorXf"
-    sh: "mi.TensorXf"
-    base_color: "mi.TensorXf"
-    roughness: "mi.TensorXf"
-    metallic: "mi.TensorXf"
-    delta_normal: "mi.TensorXf"
-    curvature: "mi.TensorXf"
-    two_sided: bool = True
-    columns: "dict[str, list[mi.Float]] | None" = None
+    def __init__(
+        self, columns: "dict[str, list[mi.Float]]", two_sided: bool = True, index: "mi.UInt32 | None" = None
+    ) -> None:
+        self._columns, self.two_sided, self.index = columns, two_sided, index
 
     def __len__(self) -> int:
-        return self.centers.shape[0]
+        return dr.width(self._columns["centers"])
 
-    @classmethod
-    def from_numpy(cls, arrays: dict[str, np.ndarray], two_sided: bool = True) -> "Surfels":
-        """Make surfels of arrays [N, channels] by the names of the fields; without ``curvature`` normals are the same all
-        over each surfel."""
-        arrays = {"curvature": np.zeros((len(arrays["centers"]), 3))} | arrays
-        return cls(
-            **{name: mi.TensorXf(np.ascontiguousarray(arrays[name], np.float32)) for name in CHANNELS}, two_sided=two_sided
-        )
-
-    def numpy(self) -> dict[str, np.ndarray]:
-        """Return each field as a float32 array [N, channels], detached."""
-        return {name: dr.detach(getattr(self, name)).numpy() for name in CHANNELS}
+    def channels(self, name: str) -> int:
+        """Return how many columns the field ``name`` has."""
+        return len(self._columns[name])
 
     def column(self, kind: type, name: str) -> Any:
         """Return the field ``name`` as a Dr.Jit array of type ``kind`` and width N, e.g. ``column(mi.Point3f, "centers")``;
         differentiable."""
-        if kind is mi.Float:
-            return self._gather(name, 0)
-        return kind(*[self._gather(name, k) for k in range(getattr(self, name).shape[1])])
+        return self._column(name, 0) if kind is mi.Float else kind(*self.all_columns(name))
 
-    def split(self) -> "Surfels":
-        """Return the same surfels with `columns`: the derivative of reading them is one kernel for all, and copies what it has
-        where that of each `column` adds number by number. Differentiable; to be called where gradients are as they are where
-        columns are used."""
-        tensors = [getattr(self, name) for name in CHANNELS]
-        values = iter(columns_of([t.array for t in tensors], [t.shape[1] for t in tensors]))
-        return replace(self, columns={name: [next(values) for _ in range(t.shape[1])] for name, t in zip(CHANNELS, tensors)})
+    def all_columns(self, name: str) -> "list[mi.Float]":
+        """Return the columns of the field ``name``, of width N each; differentiable."""
+        return [self._column(name, k) for k in range(self.channels(name))]
 
-    def _gather(self, name, k):
-        """Column ``k``. Each number is read once, so that the derivative needs no atomics, nor copies for each thread: these
-        would compile the number of surfels into the kernel."""
-        if self.columns is not None:
-            return self.columns[name][k]
-        tensor = getattr(self, name)
-        index = dr.arange(mi.UInt32, len(self)) * tensor.shape[1] + k
-        return dr.gather(mi.Float, tensor.array, index, mode=dr.ReduceMode.NoConflicts)
+    def _column(self, name, k):
+        return self._columns[name][k]
 
-    def take(self, index: "mi.UInt32") -> "Surfels":
+    def split(self) -> "SurfelColumns":
+        """Return the same surfels as columns that have been read."""
+        return self
+
+    def with_columns(self, columns: "dict[str, list[mi.Float]]") -> "SurfelColumns":
+        """Return the same surfels with other ``columns`` in place of those that these name."""
+        own = {name: self.all_columns(name) for name in CHANNELS if name not in columns}
+        return SurfelColumns(own | columns, self.two_sided, self.index)
+
+    def take(self, index: "mi.UInt32") -> "SurfelColumns":
         """Return the surfels ``index``, of which some may repeat; differentiable."""
-
-        def rows(tensor):
-            count, channels = dr.width(index), tensor.shape[1]
-            entry = dr.arange(mi.UInt32, count * channels)
-            source = dr.gather(mi.UInt32, index, entry // channels) * channels + entry % channels
-            return mi.TensorXf(dr.gather(mi.Float, tensor.array, source, mode=dr.ReduceMode.Local), (count, channels))
-
-        return Surfels(**{name: rows(getattr(self, name)) for name in CHANNELS}, two_sided=self.two_sided)
+        of_scene = index if self.index is None else dr.gather(mi.UInt32, self.index, index)
+        columns = {name: [dr.gather(mi.Float, column, index) for column in self.all_columns(name)] for name in CHANNELS}
+        return SurfelColumns(columns, self.two_sided, of_scene)
 
     def frames(self) -> "tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]":
         """Return (t_u, t_v, n), the unit tangents and normal of every surfel in world space, each of width N."""
@@ -146,11 +111,88 @@ class Surfels:
     def radiance(self, direction: "mi.Vector3f") -> "mi.Color3f":
         """Return the diffuse radiance (linear) of every surfel seen along the world-space unit ``direction`` from the camera,
         of width N."""
-        basis = dr.sh_eval(direction, sh_order(self.sh.shape[1]))
+        basis = dr.sh_eval(direction, sh_order(self.channels("sh")))
         value = mi.Color3f(0.5)
         for k, Y in enumerate(basis):
-            value += Y * mi.Color3f(*[self._gather("sh", 3 * k + c) for c in range(3)])
+            value += Y * mi.Color3f(*[self._column("sh", 3 * k + c) for c in range(3)])
         return dr.maximum(value, 0)
+
+
+@dataclass
+class Surfels(SurfelColumns):
+    """N surfels. Every field is a tensor of shape [N, channels] in its physical range.
+
+    centers       positions, world space
+    rotations     unit quaternions (x, y, z, w), the order of Mitsuba and Dr.Jit, while 3DGS's PLY columns rot_0 … rot_3 are
+                  (w, x, y, z); the columns of their matrix are the tangents t_u, t_v and the normal, world space
+    scales        standard deviations along t_u and t_v, world units, > 0
+    opacities     in (0, 1)
+    sh            diffuse radiance, linear: max(0, 1/2 + Σ_k sh_k Y_k(d)), d from the camera to the center (3DGS)
+    base_color, roughness, metallic   principled BSDF parameters in [0, 1]
+    delta_normal  the residual Δn that is added to the normal (RGS), world space
+    curvature     K_uu, K_uv, K_vv: how the normal turns across the surfel, radians per √(s_u s_v); see `normal_derivatives`
+    two_sided     whether surfels show from behind, with the normal turned to the camera (2DGS); one-sided ones, whose
+                  normals point outwards, keep the far side of a closed object from bending its silhouette's normals
+    """
+
+    centers: "mi.TensorXf"
+    rotations: "mi.TensorXf"
+    scales: "mi.TensorXf"
+    opacities: "mi.TensorXf"
+    sh: "mi.TensorXf"
+    base_color: "mi.TensorXf"
+    roughness: "mi.TensorXf"
+    metallic: "mi.TensorXf"
+    delta_normal: "mi.TensorXf"
+    curvature: "mi.TensorXf"
+    two_sided: bool = True
+
+    def __len__(self) -> int:
+        return self.centers.shape[0]
+
+    @classmethod
+    def from_numpy(cls, arrays: dict[str, np.ndarray], two_sided: bool = True) -> "Surfels":
+        """Make surfels of arrays [N, channels] by the names of the fields; without ``curvature`` normals are the same all
+        over each surfel."""
+        arrays = {"curvature": np.zeros((len(arrays["centers"]), 3))} | arrays
+        return cls(
+            **{name: mi.TensorXf(np.ascontiguousarray(arrays[name], np.float32)) for name in CHANNELS}, two_sided=two_sided
+        )
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Return each field as a float32 array [N, channels], detached."""
+        return {name: dr.detach(getattr(self, name)).numpy() for name in CHANNELS}
+
+    def channels(self, name: str) -> int:
+        """Return how many columns the field ``name`` has."""
+        return getattr(self, name).shape[1]
+
+    def split(self) -> SurfelColumns:
+        """Return the same surfels as columns that have been read: the derivative of that is one kernel for all, and copies what
+        it has where that of each `column` adds number by number. Differentiable; to be called where gradients are as they are
+        where columns are used."""
+        tensors = [getattr(self, name) for name in CHANNELS]
+        values = iter(columns_of([t.array for t in tensors], [t.shape[1] for t in tensors]))
+        columns = {name: [next(values) for _ in range(t.shape[1])] for name, t in zip(CHANNELS, tensors)}
+        return SurfelColumns(columns, self.two_sided)
+
+    def _column(self, name, k):
+        """Column ``k``. Each number is read once, so that the derivative needs no atomics, nor copies for each thread: these
+        would compile the number of surfels into the kernel."""
+        tensor = getattr(self, name)
+        index = dr.arange(mi.UInt32, len(self)) * tensor.shape[1] + k
+        return dr.gather(mi.Float, tensor.array, index, mode=dr.ReduceMode.NoConflicts)
+
+    def take(self, index: "mi.UInt32") -> "Surfels":
+        """Return the surfels ``index``, of which some may repeat; differentiable."""
+
+        def rows(tensor):
+            count, channels = dr.width(index), tensor.shape[1]
+            entry = dr.arange(mi.UInt32, count * channels)
+            source = dr.gather(mi.UInt32, index, entry // channels) * channels + entry % channels
+            return mi.TensorXf(dr.gather(mi.Float, tensor.array, source, mode=dr.ReduceMode.Local), (count, channels))
+
+        return Surfels(**{name: rows(getattr(self, name)) for name in CHANNELS}, two_sided=self.two_sided)
 
 
 def columns_of(arrays: "list[mi.Float]", channels: list[int]) -> "list[mi.Float]":

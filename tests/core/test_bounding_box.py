@@ -140,11 +140,8 @@ def test_far_surfels_may_be_large():
 
     def left(extent):
         model = Model.start(positions, None, colors, spacing, light, np.eye(3), 1)
-        for name in model.optimizer.keys():
-            dr.set_grad(model[name], dr.zeros(mi.TensorXf, model[name].shape))
-        model.optimizer.step()
         statistics, nothing = Statistics(3), dr.zeros(mi.Vector2f, 3)
-        statistics.add(nothing, nothing, dr.full(mi.Bool, True, 3), (100, 100))
+        statistics.add(dr.arange(mi.UInt32, 3), nothing, nothing, dr.full(mi.Bool, True, 3), (100, 100))
         densify(model, statistics, extent, Density(), np.random.default_rng(0), 10)
         return model.numpy("centers")
 

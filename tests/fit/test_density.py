@@ -17,11 +17,12 @@ def model():
     normals = rng.normal(size=(N, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     m = Model.start(normals, normals, rng.uniform(0, 1, (N, 3)), np.full(N, 0.005), np.full((8, 16, 3), 0.5), np.eye(3), 2)
-    for name in m.optimizer.keys():  # moments that tell the surfels apart
-        rows = np.arange(1, 1 + m[name].shape[0], dtype=np.float32).reshape(-1, *[1] * (m[name].ndim - 1))
-        dr.set_grad(m.optimizer[name], mi.TensorXf(np.broadcast_to(rows, m[name].shape).copy()))
-    m.optimizer.set_learning_rate({name: 1e-6 for name in m.optimizer.keys()})
-    m.optimizer.step()
+    m.set_rates(dict.fromkeys(m.names(), 1e-6))
+    dr.set_grad(m[ENVIRONMENT], dr.ones(mi.TensorXf, m[ENVIRONMENT].shape))
+    floats = dr.width(m.rows.values)
+    m.step(
+        dr.arange(mi.UInt32, N), 1 + mi.Float(dr.arange(mi.UInt32, floats) // (floats // N))
+    )  # moments that tell the surfels apart
     return m
 
 
@@ -33,7 +34,7 @@ def gradients(values, seen=None):
 
 
 def moment(m, name):
-    return m.optimizer.state[name][3][1].numpy().reshape(len(m), -1)[:, 0]
+    return m.rows.numpy(name, "m")[:, 0]
 
 
 def test_small_surfels_are_cloned_and_moments_follow():
@@ -162,8 +163,12 @@ def test_none_but_those_with_more_than_their_share_grow():
 def test_state_round_trip():
     m = model()
     again = Model.from_state(m.state())
-    for name in [*SURFEL_PARAMETERS, ENVIRONMENT]:
+    for name in m.names():
         assert np.array_equal(m.numpy(name), again.numpy(name))
-        for a, b in zip(m.optimizer.state[name][3][:3], again.optimizer.state[name][3][:3]):
-            assert np.array_equal(np.array(a).ravel(), np.array(b).ravel())
+    for name in SURFEL_PARAMETERS:
+        for of in ("m", "v"):
+            assert m.rows.numpy(name, of).any() and np.array_equal(m.rows.numpy(name, of), again.rows.numpy(name, of))
+    assert m.rows.steps == again.rows.steps == 1
+    for a, b in zip(m.optimizer.state[ENVIRONMENT][3][:3], again.optimizer.state[ENVIRONMENT][3][:3]):
+        assert np.array_equal(np.array(a).ravel(), np.array(b).ravel())
     assert not again.two_sided

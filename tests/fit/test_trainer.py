@@ -85,7 +85,7 @@ def test_density_control_does_not_ask_for_the_number_of_samples(dataset):
         stages, density = (Stage(spp=spp),), replace(SETTINGS.density, prune_weight=0.05)
         fit = Fit(dataset, model(), replace(SETTINGS, stages=stages, density=density), 1.0)
         fit.photographs, statistics = Photographs(dataset.train, 1, 1.0), Statistics(300)
-        fit._view(2, fit.model.surfels(0), None, 1.0, statistics)
+        fit._view(2, None, 1.0, statistics)
         found.append([values.numpy().sum() for values in (statistics.gradient, statistics.weight, statistics.share)])
     np.testing.assert_allclose(found[1][1:], found[0][1:], rtol=0.03)
     assert found[1][0] == pytest.approx(found[0][0], rel=0.35)
@@ -157,7 +157,7 @@ def test_steps_note_what_surfels_make_of_pictures(dataset):
     for settings in (SETTINGS, weighing):
         fit, statistics = Fit(dataset, model(), settings, 1.0), Statistics(len(model()))
         fit.photographs = Photographs(dataset.train, 1, 1.0)
-        loss = fit._view(3, fit.model.surfels(0), None, 1.0, statistics)
+        loss = fit._view(3, None, 1.0, statistics)
         found.append((float(loss["loss.photometric"][0]), statistics.gradient.numpy()))
         assert settings is weighing or not (statistics.weight.numpy().any() or statistics.share.numpy().any())
     assert found[0][0] == found[1][0]
@@ -184,7 +184,7 @@ def test_tiles_of_a_large_window_estimate_it(dataset, monkeypatch):
 
     def measured():
         statistics = Statistics(len(fit.model))
-        loss = fit._view(view, fit.model.surfels(0), None, 1.0, statistics)
+        loss = fit._view(view, None, 1.0, statistics)
         return float(loss["loss.photometric"][0]), float(loss["error"][0]), statistics.gradient.numpy()
 
     expected = measured()
@@ -425,7 +425,7 @@ def test_normals_of_a_hull_wait_for_the_light(dataset, two_sided, normals_start,
     assert moved["rotations"] == pytest.approx(part * 2e-3, rel=0.01) and moved["centers"] == pytest.approx(5e-4, rel=0.01)
     fit.step_number = 8  # of 40
     fit._follow_schedule()
-    assert fit.model.optimizer.learning_rate("rotations") == pytest.approx(2e-3 * 0.1**0.2)
+    assert fit.model.rows.rates["rotations"] == pytest.approx(2e-3 * 0.1**0.2)
 
 
 @pytest.mark.parametrize("cooldown, parts", [(0.25, [1, 1, 0.5, 0.1]), (0.0, [1, 1, 1, 1])])
@@ -433,9 +433,10 @@ def test_rates_fall_to_zero_in_the_end(dataset, cooldown, parts):
     fit = Fit(dataset, model(), replace(SETTINGS, cooldown=cooldown), 1.0)
     for fit.step_number, part in zip((20, 30, 35, 39), parts):
         fit._follow_schedule()
+        set_to = fit.model.rows.rates | {"log_environment": fit.model.optimizer.learning_rate("log_environment")}
         for name, (first, last) in (("centers", (5e-4, 1e-5)), ("log_environment", (6e-2, 5e-3))):
             rate = first * (last / first) ** (fit.step_number / 40)
-            assert fit.model.optimizer.learning_rate(name) == pytest.approx(part * rate)
+            assert set_to[name] == pytest.approx(part * rate)
 
 
 def test_a_light_that_is_given_keeps_its_rows(dataset):

@@ -122,7 +122,7 @@ def test_no_kernel_is_compiled_for_another_number_of_pixels():
 
 def mlp_model():
     plain = model()
-    parameters = {name: plain.numpy(name) for name in plain.optimizer.keys()}
+    parameters = {name: plain.numpy(name) for name in plain.names()}
     return Model(parameters | {"shader": initial_weights(0)}, np.eye(3), two_sided=False)
 
 
