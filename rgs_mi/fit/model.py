@@ -68,11 +68,11 @@ class Model:
         self.center = np.asarray(center, np.float64)
         self.rows = Rows({name: parameters[name] for name in SURFEL_PARAMETERS})
         self.optimizer = mi.ad.Adam(lr=1e-3, epsilon=EPSILON)
-        for name in parameters.keys() - set(SURFEL_PARAMETERS):
-            self.optimizer[name] = as_tensor(parameters[name])
-        self._taken: list[
-            tuple[mi.UInt32, mi.Float, bool]
-        ] = []  # rows that a step has asked for: which, and whether each once
+        for name, value in parameters.items():
+            if name not in SURFEL_PARAMETERS:
+                self.optimizer[name] = as_tensor(value)
+        # What a step has asked for: which surfels, their rows, and whether none is there twice
+        self._taken: list[tuple[mi.UInt32, mi.Float, bool]] = []
 
     @classmethod
     def start(

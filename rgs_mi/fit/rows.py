@@ -49,7 +49,7 @@ class Rows:
         self.rates, self.steps = dict.fromkeys(fields, 0.0), steps
         values = self._interleaved(fields)
         m, v = map(self._interleaved, moments) if moments else (np.zeros_like(values), np.zeros_like(values))
-        self._restore(values, m, v)
+        self._keep(*map(as_float, (values, m, v)))
         if last is not None:
             self._last, self._resting = mi.UInt32(as_float(last)), True
             dr.make_opaque(self._last)
@@ -144,23 +144,26 @@ class Rows:
         """Bring all rows to where they are by now."""
         if not self._resting:
             return
-        row, packet, column, _ = self._packets(dr.arange(mi.UInt32, len(self)))
-        state = self._rested(row, packet, column)
-        self.values, self._m, self._v = (dr.empty(mi.Float, len(self) * self._stride) for _ in range(3))
-        for array, value in zip((self.values, self._m, self._v), state):
-            dr.scatter(array, value, packet)
-        self._last, self._resting = dr.full(mi.UInt32, self.steps, len(self)), False
-        dr.make_opaque(self.values, self._m, self._v, self._last)
+        self._renew(dr.arange(mi.UInt32, len(self)))
+
+    def _renew(self, index, old=1):
+        """Keep the rows ``index`` as they are by now, with their moments times ``old`` (of each of them, or of all)."""
+        row, packet, column, lane = self._packets(index)
+        p, m, v = self._rested(row, packet, column)
+        old = dr.gather(mi.Float, mi.Float(old), lane // (self._stride // PACKET)) if dr.is_array_v(old) else old
+        arrays = [dr.empty(mi.Float, dr.width(index) * self._stride) for _ in range(3)]
+        for array, value in zip(arrays, (p, m * old, v * old)):
+            dr.scatter(array, value, lane)
+        self._keep(*arrays)
 
     # ---- As a whole ----
 
     def state(self) -> dict[str, np.ndarray]:
         """Return everything that a checkpoint needs: each name's parameters, its moments as name.m and name.v, all as they are
         kept, the number of steps as name.t, and the step of which each row is as `LAST`."""
-        arrays = {LAST: self._last.numpy()} | {f"{name}.t": np.array(self.steps) for name in self._channels}
-        for of, array in (("", self.values), (".m", self._m), (".v", self._v)):
-            matrix = array.numpy().reshape(-1, self._stride)
-            arrays |= {name + of: np.ascontiguousarray(matrix[:, self._slice(name)]) for name in self._channels}
+        arrays = {LAST: self._last.numpy().copy()} | {f"{name}.t": np.array(self.steps) for name in self._channels}
+        for suffix, of in (("", "value"), (".m", "m"), (".v", "v")):
+            arrays |= {name + suffix: self._columns_of(name, of) for name in self._channels}
         return arrays
 
     @classmethod
@@ -172,32 +175,36 @@ class Rows:
     def numpy(self, name: str, of: str = "value") -> np.ndarray:
         """Return the parameters ``name`` of all rows, or their first or second moments, where ``of`` is 'm' or 'v',
         [N, channels]."""
-        return np.ascontiguousarray(self._matrices()[("value", "m", "v").index(of)][:, self._slice(name)])
+        self.catch_up()
+        return self._columns_of(name, of)
 
     def set(self, name: str, value: np.ndarray, m: np.ndarray | float = 0.0, v: np.ndarray | float = 0.0) -> None:
         """Replace the parameters ``name`` of all rows, [N, channels], and their moments."""
-        matrices = self._matrices()
+        self.catch_up()
+        matrices = [array.numpy().reshape(-1, self._stride).copy() for array in (self.values, self._m, self._v)]
         for matrix, new in zip(matrices, (value, m, v)):
             matrix[:, self._slice(name)] = new
-        self._restore(*matrices)
+        self._keep(*map(as_float, matrices))
 
     def select(self, index: np.ndarray, changes: Mapping[str, np.ndarray], fresh: np.ndarray) -> None:
         """Keep the rows ``index`` (any order, repeats allowed) with their moments, but for those that are ``fresh``, and then
         overwrite parameters by ``changes`` {name: [rows, channels]}."""
-        values, m, v = (matrix[index] for matrix in self._matrices())
+        self._renew(mi.UInt32(as_float(index)), as_float(~fresh))
+        row = dr.arange(mi.UInt32, len(index)) * self._stride
         for name, value in changes.items():
-            values[:, self._slice(name)] = value
-        m[fresh], v[fresh] = 0, 0
-        self._restore(values, m, v)
+            for k, column in enumerate(np.transpose(value), self._slice(name).start):
+                dr.scatter(self.values, as_float(column), row + k)
+        dr.eval(self.values)
 
-    def _matrices(self):
-        """All rows, and their moments, as they are by now, [N, stride] each, copies."""
-        self.catch_up()
-        return [array.numpy().reshape(-1, self._stride).copy() for array in (self.values, self._m, self._v)]
+    def _columns_of(self, name, of):
+        """[N, channels], a copy, of the rows as they are kept: steps write into these in place."""
+        array = {"value": self.values, "m": self._m, "v": self._v}[of]
+        return array.numpy().reshape(-1, self._stride)[:, self._slice(name)].copy()
 
-    def _restore(self, values, m, v):
-        self.values, self._m, self._v = map(as_float, (values, m, v))
-        self._last, self._resting = dr.full(mi.UInt32, self.steps, len(values)), False
+    def _keep(self, values, m, v):
+        """Have these floats as all rows, of now, and their moments."""
+        self.values, self._m, self._v = values, m, v
+        self._last, self._resting = dr.full(mi.UInt32, self.steps, dr.width(values) // self._stride), False
         dr.make_opaque(self.values, self._m, self._v, self._last)
 
     def _slice(self, name):
