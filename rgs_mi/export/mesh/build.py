@@ -10,7 +10,7 @@ from ...core.bounding_box import BoundingBox
 from ...core.camera import Camera
 from ...core.errors import UserError
 from ...core.progress import Progress
-from ...surfels.surfels import Surfels
+from ...surfels.surfels import SurfelColumns
 from . import tsdf
 from .depth_maps import depth_map
 from .lookup import look_up
@@ -34,7 +34,7 @@ class TexturedMesh:
 
 
 def build(
-    surfels: Surfels,
+    surfels: SurfelColumns,
     cameras: Sequence[Camera],
     path: str | Path,
     *,

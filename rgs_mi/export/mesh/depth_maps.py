@@ -8,10 +8,10 @@ from ...splat.composite import median_depth
 from ...splat.intersect import isect_tiles
 from ...splat.project import project
 from ...splat.tiles import Cutoffs
-from ...surfels.surfels import Surfels
+from ...surfels.surfels import SurfelColumns
 
 
-def depth_map(surfels: Surfels, camera: Camera) -> "tuple[mi.Float, mi.Float]":
+def depth_map(surfels: SurfelColumns, camera: Camera) -> "tuple[mi.Float, mi.Float]":
     """Return the `median_depth` of what ``camera`` sees of ``surfels``, and how much of each pixel they cover."""
     with dr.suspend_grad():
         projected = project(surfels, camera)

@@ -18,7 +18,7 @@ import numpy as np
 from ...core.arrays import as_float
 from ...core.camera import Camera, opaque, pixels_of
 from ...splat.gbuffer import render_gbuffer
-from ...surfels.surfels import Surfels
+from ...surfels.surfels import SurfelColumns
 
 CHANNELS = {"radiance": 3, "normal": 3, "base_color": 3, "roughness": 1, "metallic": 1}
 _GRAZING = 0.15  # least n·ω
@@ -44,7 +44,7 @@ class Seen:
 
 
 def look_up(
-    surfels: Surfels,
+    surfels: SurfelColumns,
     cameras: Sequence[Camera],
     depths: "Sequence[mi.Float]",
     points: np.ndarray,
