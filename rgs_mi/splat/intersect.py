@@ -23,6 +23,7 @@ from .tiles import BLOCK, LOW_PASS, TILE, Cutoffs, block_pixels, tile_grid
 
 FAR = 1e6  # pixels: beyond every image
 SORT_RADIUS = 3.0  # standard deviations
+_OCTAVE, _INFINITY = 1 << 23, 0x7F800000  # in bits of floats
 _HIDDEN = 0.1  # of the least transmittance: where a list ends, for what its block's own order brings forward
 
 
@@ -39,13 +40,34 @@ class TileIntersections:
 
 @dataclass
 class _Unsorted:
-    """What each block sees, not in its order yet: ``entries`` are pairs of the depth at which its middle meets a surfel and of
-    that surfel's index, in the bits of a float (one packet of two is read and written faster than two numbers); ``first`` and
-    ``count`` each block's range of these pairs."""
+    """What each block sees, not in its order yet. ``keys`` are the depths at which its middle meets surfels, and in the ``low``
+    bits below that these surfels' places in the list of its tile, which begins at ``tile_first``; ``first`` and ``count`` are
+    each block's range of keys."""
 
-    entries: "mi.Float"
+    keys: "mi.UInt32"
+    low: int
+    tile_first: "mi.UInt32"
     first: "mi.UInt32"
     count: "mi.UInt32"
+
+
+@dataclass(frozen=True)
+class _Depths:
+    """Positive floats, from one with the bits ``least`` to one with the bits ``most``, as numbers of fewer bits: floats are in
+    the order of their bits, which are steps of some part of themselves."""
+
+    least: int
+    most: int
+
+    def wider(self) -> "_Depths":
+        """Return the same, and an octave more to either side."""
+        return _Depths(max(self.least - _OCTAVE, 0), min(self.most + _OCTAVE, _INFINITY))
+
+    def steps(self, depth: "mi.Float", bits: int) -> "mi.UInt32":
+        """Return ``depth`` as a number of so many ``bits``; what lies beyond the ends is there."""
+        drop = max((self.most - self.least).bit_length() - bits, 0)
+        least, most, drop = (dr.opaque(mi.UInt32, number) for number in (self.least, self.most, drop))
+        return (dr.clip(dr.reinterpret_array(mi.UInt32, dr.fmax(depth, 0)), least, most) - least) >> drop
 
 
 @dataclass
@@ -126,8 +148,8 @@ def isect_tiles(projected: Projected, size: tuple[int, int], cutoffs: Cutoffs) -
     """Return the surfels that every block of an image of ``size`` (width, height) pixels sees, in the order in which it meets
     them; blocks are in the order of `block_pixels`. Not differentiated."""
     with dr.suspend_grad():
-        tiles = _tile_intersections(projected, size, cutoffs.alpha_min)
-        return _sorted(_seen_by_blocks(projected, size, tiles, cutoffs), tiles.seen, cutoffs)
+        tiles, depths = _tile_intersections(projected, size, cutoffs.alpha_min)
+        return _sorted(_seen_by_blocks(projected, size, tiles, depths, cutoffs), tiles, cutoffs)
 
 
 def in_view(projected: Projected, size: tuple[int, int], cutoffs: Cutoffs) -> "mi.Bool":
@@ -143,23 +165,24 @@ def in_view(projected: Projected, size: tuple[int, int], cutoffs: Cutoffs) -> "m
         return drawn & projected.visible
 
 
-def _seen_by_blocks(projected, size, tiles, cutoffs):
-    """`_Unsorted` lists of blocks, in the order of their tiles. They end where nothing behind can be seen any more, or a little
-    later."""
+def _seen_by_blocks(projected, size, tiles, depths, cutoffs):
+    """`_Unsorted` lists of blocks, in the order of their tiles, in which surfels have such `_Depths`. They end where nothing
+    behind can be seen any more, or a little later."""
     tile, pixels = block_pixels(size)
     first, count = (dr.gather(mi.UInt32, values, tile) for values in (tiles.first, tiles.count))
     end, blocks = first + count, dr.width(tile) // dr.width(tiles.first)
     start = first * blocks + count * (dr.arange(mi.UInt32, dr.width(tile)) % blocks)  # room for the whole tile's list
     x, y = (mi.Float(corner) + 0.5 * n for corner, n in zip(pixels[0], BLOCK))
     gaussians = pack([*projected.geometry, reach(projected.geometry, cutoffs)])
-    entries = dr.empty(mi.Float, 2 * dr.width(tiles.ids) * blocks)
+    keys, low = dr.empty(mi.UInt32, dr.width(tiles.ids) * blocks), max(int(dr.max(tiles.count)[0]) - 1, 1).bit_length()
+    near, shift = depths.wider(), dr.opaque(mi.UInt32, low)
     dr.eval(gaussians, first, end, start, x, y)
 
     def step(i, at, T):
         surfel = dr.gather(mi.UInt32, tiles.ids, i)
         *gaussian, farthest, _ = fetch(gaussians, surfel, padded(len(projected.geometry) + 1))
         depth, seen, alphas = Hit(gaussian, x, y, cutoffs).in_block(gaussian, farthest, cutoffs)
-        dr.scatter(entries, mi.Vector2f(depth, dr.reinterpret_array(mi.Float, surfel)), at, seen)
+        dr.scatter(keys, (near.steps(depth, 32 - low) << shift) | (i - first), at, seen)
         return i + 1, at + dr.select(seen, mi.UInt32(1), 0), [t - t * alpha for t, alpha in zip(T, alphas)]
 
     def alive(i, at, T):
@@ -167,51 +190,50 @@ def _seen_by_blocks(projected, size, tiles, cutoffs):
 
     past = dr.while_loop((first, start, [mi.Float(1) for _ in pixels]), alive, step, label="list")[1]
     count = past - start
-    dr.eval(entries, count)
-    return _Unsorted(entries, start, count)
+    dr.eval(keys, count)
+    return _Unsorted(keys, low, first, start, count)
 
 
-def _sorted(lists, seen, cutoffs) -> TileIntersections:
-    """The ``lists`` of blocks in the order of their depths, but for surfels that are farther than a queue from their place;
-    ``seen`` is that of the tiles."""
+def _sorted(lists, tiles, cutoffs) -> TileIntersections:
+    """The ``lists`` of blocks of ``tiles`` in the order of their depths, but for surfels that are farther than a queue from
+    their place."""
     first = dr.prefix_reduce(dr.ReduceOp.Add, lists.count, exclusive=True)
     total = int(first[-1] + lists.count[-1])
     if total == 0:
-        return TileIntersections(dr.zeros(mi.UInt32, 1), first, lists.count, seen)
+        return TileIntersections(dr.zeros(mi.UInt32, 1), first, lists.count, tiles.seen)
     ids, length = dr.empty(mi.UInt32, total), cutoffs.resort_window
     stop = dr.select(lists.count > 0, lists.count + length, 0)
+    places = dr.opaque(mi.UInt32, (1 << lists.low) - 1)
 
-    def step(i, depths, surfels):
+    def step(i, queue):
         # One surfel enters the queue, the nearest leaves it; "farther than all" drives the rest out in the end.
         listed = i < lists.count
-        depth, surfel = dr.gather(mi.Vector2f, lists.entries, lists.first + i, listed)
-        depth, surfel = dr.select(listed, depth, dr.inf), dr.reinterpret_array(mi.UInt32, surfel)
+        key = dr.select(listed, dr.gather(mi.UInt32, lists.keys, lists.first + i, listed), 0xFFFFFFFF)
         for k in reversed(range(length)):
-            nearer = depth < depths[k]
-            depth, depths[k] = dr.minimum(depth, depths[k]), dr.maximum(depth, depths[k])
-            surfel, surfels[k] = dr.select(nearer, surfel, surfels[k]), dr.select(nearer, surfels[k], surfel)
-        dr.scatter(ids, surfel, first + i - length, i >= length)
-        return i + 1, depths, surfels
+            key, queue[k] = dr.minimum(key, queue[k]), dr.maximum(key, queue[k])
+        leaves = i >= length
+        surfel = dr.gather(mi.UInt32, tiles.ids, lists.tile_first + (key & places), leaves)
+        dr.scatter(ids, surfel, first + i - length, leaves)
+        return i + 1, queue
 
-    state = mi.UInt32(0), [mi.Float(-dr.inf)] * length, [mi.UInt32(0)] * length
-    dr.eval(dr.while_loop(state, lambda i, depths, surfels: i < stop, step, label="sort"))
+    state = mi.UInt32(0), [mi.UInt32(0)] * length
+    dr.eval(dr.while_loop(state, lambda i, queue: i < stop, step, label="sort"))
     dr.eval(ids)
-    return TileIntersections(ids, first, lists.count, seen)
+    return TileIntersections(ids, first, lists.count, tiles.seen)
 
 
-def _sort_key(tile, depth, tiles):
-    """One number of 32 bits to sort by: the ``tile``, of so many ``tiles``, then the ``depth``, as finely as there are bits left.
-    Between the nearest and the farthest positive floats are in the order of their bits, which are steps of some part of
-    themselves: of 1e-4 and less, as a rule, which the blocks' own order mends."""
+def _sort_keys(tile, depth, tiles):
+    """Numbers of 32 bits to sort by: the ``tile``, of so many ``tiles``, then the ``depth``, as finely as there are bits left: to
+    1e-4 and less, as a rule, which the blocks' own order mends. And what `_Depths` these are."""
     bits = dr.reinterpret_array(mi.UInt32, dr.fmax(depth, 0))
-    least, most = (int(reduced(bits)[0]) for reduced in (dr.min, dr.max))
+    depths = _Depths(*(int(reduced(bits)[0]) for reduced in (dr.min, dr.max)))
     room = 32 - max(tiles - 1, 1).bit_length()
-    drop = max((most - least).bit_length() - room, 0)
-    return (tile << room) | ((bits - dr.opaque(mi.UInt32, least)) >> dr.opaque(mi.UInt32, drop))
+    return (tile << room) | depths.steps(depth, room), depths
 
 
-def _tile_intersections(projected, size, alpha_min) -> TileIntersections:
-    """The surfels of every tile, sorted by `_depth_at_tile`. Call it where gradients are suspended."""
+def _tile_intersections(projected, size, alpha_min) -> tuple[TileIntersections, _Depths]:
+    """The surfels of every tile, sorted by `_depth_at_tile`, and what `_Depths` these are. Call it where gradients are
+    suspended."""
     columns, rows = tile_grid(size)
     outline, drawn = _outline(projected.geometry, alpha_min)
     drawn &= projected.visible
@@ -242,7 +264,8 @@ def _tile_intersections(projected, size, alpha_min) -> TileIntersections:
     n_tiles = columns * rows
     seen = entries > 0
     if total == 0:
-        return TileIntersections(dr.zeros(mi.UInt32, 1), dr.zeros(mi.UInt32, n_tiles), dr.zeros(mi.UInt32, n_tiles), seen)
+        none = dr.zeros(mi.UInt32, n_tiles)
+        return TileIntersections(dr.zeros(mi.UInt32, 1), none, none, seen), _Depths(0, 0)
     tile, surfel, depth = dr.empty(mi.UInt32, total), dr.empty(mi.UInt32, total), dr.empty(mi.Float, total)
     surfels = dr.arange(mi.UInt32, dr.width(entries))
 
@@ -262,6 +285,7 @@ def _tile_intersections(projected, size, alpha_min) -> TileIntersections:
     length = dr.zeros(mi.UInt32, n_tiles)
     dr.scatter_reduce(dr.ReduceOp.Add, length, mi.UInt32(1), tile)
     first = dr.prefix_reduce(dr.ReduceOp.Add, length, exclusive=True)
-    ids = dr.gather(mi.UInt32, surfel, dr.argsort(_sort_key(tile, depth, n_tiles)))
+    keys, depths = _sort_keys(tile, depth, n_tiles)
+    ids = dr.gather(mi.UInt32, surfel, dr.argsort(keys))
     dr.eval(ids, first, length, seen)
-    return TileIntersections(ids, first, length, seen)
+    return TileIntersections(ids, first, length, seen), depths
