@@ -108,11 +108,13 @@ class DensityControl:
             return None
         return guided(model.numpy("centers"), *zip(*self.reflective.values()))
 
-    def refine(self, model: Model, rng: np.random.Generator, budget: int | None) -> None:
-        """End a round of statistics: `densify`, unless ``budget`` is None, and begin the next."""
+    def refine(self, model: Model, rng: np.random.Generator, budget: int | None) -> np.ndarray | None:
+        """End a round of statistics: `densify`, unless ``budget`` is None, and begin the next. Returns what `densify` does."""
+        parents = None
         if budget is not None:
-            densify(model, self.statistics, self._extents(model), self.settings, rng, budget, self.guided(model))
+            parents = densify(model, self.statistics, self._extents(model), self.settings, rng, budget, self.guided(model))
         self.statistics = Statistics(len(model))
+        return parents
 
     def _extents(self, model):
         """What is large for a surfel: the object, or the distance from it in the surroundings."""
@@ -129,9 +131,9 @@ def densify(
     rng: np.random.Generator,
     budget: int,
     guided: np.ndarray | None = None,
-) -> None:
-    """Do one round of density control, in place. ``extent`` is the radius of the object in world units, or [N] what is large
-    for each surfel.
+) -> np.ndarray | None:
+    """Do one round of density control, in place; returns which surfel each one was before, or was made of, None where all stay
+    as they are. ``extent`` is the radius of the object in world units, or [N] what is large for each surfel.
 
     Surfels grow, the neediest first while ``budget`` (surfels in all) lasts, by what `Density.grow_by` says:
 
@@ -148,7 +150,7 @@ def densify(
     keep = listed & (opacity > settings.prune_opacity) & (largest < 0.3 * extent)
     keep &= weight >= settings.prune_weight * weight.mean()
     if not keep.any():
-        return
+        return None
 
     if settings.grow_by == "loss":
         share = statistics.mean("share")
@@ -183,6 +185,7 @@ def densify(
     twins = np.flatnonzero(grown & ~large[index])
     changes["logit_opacities"][twins, 0] = logit(1 - np.sqrt(1 - opacity[index[twins]]))
     model.select(index, changes)
+    return index
 
 
 def _tangents(model):

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core.arrays import as_float
 from ..core.film import Film
 from ..core.runtime import release_memory
 from ..datasets.photographs import Photographs, tiling
@@ -212,7 +213,7 @@ class Fit:
         if sampled:
             self.irradiance_visibility = None  # its rays say by themselves what is hidden
         if due or self.proxies is None:
-            others = self.proxies is None or self.step_number % (_HIDE * _REBUILD) == 0
+            others = self.step_number % (_HIDE * _REBUILD) == 0
             self.proxies = None
             if shading.indirect != "none":
                 self.proxies = Proxies(surfels, box=shading.box)
@@ -374,7 +375,11 @@ class Fit:
         if (budget := self.schedule.surfel_budget(self.progress)) is not None:
             self.proxies = None
         self.density.share(self.ranks)
-        self.density.refine(self.model, np.random.default_rng((self.settings.seed, self.step_number)), budget)
+        parents = self.density.refine(self.model, np.random.default_rng((self.settings.seed, self.step_number)), budget)
+        if parents is not None and self.irradiance_visibility is not None:
+            parents = mi.UInt32(as_float(parents))
+            self.irradiance_visibility = dr.gather(mi.Color3f, self.irradiance_visibility, parents)
+            dr.eval(self.irradiance_visibility)
 
     # ---- Pictures ----
 

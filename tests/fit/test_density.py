@@ -43,8 +43,8 @@ def test_small_surfels_are_cloned_and_moments_follow():
     hot = np.zeros(N)
     hot[[2, 7]] = 1.0
     old = moment(m, "centers")
-    densify(m, gradients(hot), 1.0, Density(), np.random.default_rng(0), 1000)
-    assert len(m) == N + 2
+    parents = densify(m, gradients(hot), 1.0, Density(), np.random.default_rng(0), 1000)
+    assert len(m) == N + 2 and parents.tolist() == sorted([*range(N), 2, 7])
     assert np.allclose(moment(m, "centers"), np.insert(old, [3, 8], 0))  # each beside its parent
     assert np.allclose(m.numpy("centers")[[3, 9]], before["centers"][[2, 7]])
     # both twins together cover what the parent did

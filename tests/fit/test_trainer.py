@@ -311,6 +311,26 @@ def test_distortion_draws_surfels_together(dataset):
     assert spread[1000.0] < 0.7 * spread[0.0]
 
 
+def test_surfels_that_density_control_makes_hide_what_their_parents_did(dataset, monkeypatch):
+    """Rays ask every 200 steps, not after each round."""
+    asked, parents, hidden = [], [], Fit._hidden
+    monkeypatch.setattr(Fit, "_hidden", lambda fit, surfels: (asked.append(fit.step_number), hidden(fit, surfels))[1])
+    density = Density(max_surfels=400, start=0.0, stop=1.0, refine_every=10)
+    settings = replace(SETTINGS, density=density, indirect="one_bounce", indirect_start=0.0)
+    fit = Fit(dataset, model(), settings, 1.0, Shading(diffuse="relightable"))
+    refine = fit.density.refine
+    fit.density.refine = lambda *arguments: (parents.append(refine(*arguments)), parents[-1])[1]
+    for _ in range(19):
+        fit.step()
+    before = np.arange(3 * len(fit.model), dtype=np.float32).reshape(3, -1)
+    fit.irradiance_visibility = mi.Color3f(before)
+    fit.step()
+    assert len(fit.model) > before.shape[1] > 200 and len(parents) == 2
+    np.testing.assert_array_equal(np.array(fit.irradiance_visibility), before[:, parents[-1]])
+    fit.step()
+    assert asked == [0]
+
+
 @pytest.mark.parametrize(
     "indirect, diffuse",
     [("none", "radiance"), ("none", "relightable"), *(("one_bounce", d) for d in ("radiance", "relightable", "lit"))],
@@ -328,10 +348,10 @@ def test_no_kernel_is_compiled_after_warm_up(dataset, indirect, diffuse, monkeyp
         for _ in range(4):
             fit.step()
         fit.model.select(np.arange(n), {})
-        fit.density.statistics, fit.proxies = Statistics(n), None
+        fit.density.statistics, fit.proxies, fit.irradiance_visibility = Statistics(n), None, None
     fit.step()
     fit.model.select(np.arange(250), {})
-    fit.density.statistics, fit.proxies = Statistics(250), None
+    fit.density.statistics, fit.proxies, fit.irradiance_visibility = Statistics(250), None, None
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         for _ in range(8):
