@@ -308,9 +308,9 @@ def poison(root, number, undisturbed):
     def poisoned_step(self):
         recorded = step(self)
         if self.step_number == when and what in ("surfels", "environment"):
-            name = (
-                ENVIRONMENT if what == "environment" else rng.choice(["centers", "log_scales", "logit_roughness", "sh_dc"])
-            )
+            name = ENVIRONMENT
+            if what == "surfels":
+                name = rng.choice(["centers", "log_scales", "logit_roughness", "sh_dc"])
             values = self.model.numpy(name)
             values.reshape(-1)[rng.randrange(values.size)] = np.nan
             self.model.set(name, values)

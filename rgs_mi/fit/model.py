@@ -156,15 +156,8 @@ class Model:
 
     def surfels(self, sh_order: int) -> Surfels:
         """Return the surfels as they are by now, with spherical harmonics up to ``sh_order``; not differentiated."""
-        with dr.suspend_grad():
-            n, row, fields = len(self), dr.arange(mi.UInt32, len(self)), {}
-            for name, field in self._columns(self.rows.at(row), sh_order).items():
-                flat = dr.empty(mi.Float, n * len(field))
-                for k, column in enumerate(field):
-                    dr.scatter(flat, column, row * len(field) + k)
-                fields[name] = mi.TensorXf(flat, (n, len(field)))
-            dr.eval(fields)
-        return Surfels(**fields, two_sided=self.two_sided)
+        rows = self.rows.at(dr.arange(mi.UInt32, len(self)))
+        return SurfelColumns(self._columns(rows, sh_order), self.two_sided).joined()
 
     def scene(self, sh_order: int) -> SurfelColumns:
         """Return all surfels as a step meets some of them: `take` returns those that are asked for, whose gradients `gradients`

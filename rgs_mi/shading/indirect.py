@@ -132,6 +132,6 @@ class Indirect:
     def _radiance(self, index, uv, direction, lighting):
         """What the surfels ``index`` send against ``direction`` from ``uv`` on them; they in turn reflect the environment
         alone."""
-        visibility = self.irradiance_visibility
-        visibility = 1 if visibility is None else dr.gather(mi.Color3f, visibility, index)
-        return lighting.for_secondary_bounce().radiance(self.surfels.take(index), uv, -direction, visibility)
+        surfels = self.surfels.take(index)
+        visibility = self.visibility_of(surfels)
+        return lighting.for_secondary_bounce().radiance(surfels, uv, -direction, 1 if visibility is None else visibility)

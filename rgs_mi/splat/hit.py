@@ -71,11 +71,9 @@ class FetchAll(dr.CustomOp):
     def backward(self) -> None:
         adjoint = list(self.grad_out())
         dr.eval(adjoint)  # otherwise every scatter below would compute them again
-        buffer, row = (
-            dr.empty(mi.Float, self.count * self.stride),
-            dr.arange(mi.UInt32, self.count) * (self.stride // PACKET),
-        )
-        for q in range(self.stride // PACKET):
+        buffer, packets = dr.empty(mi.Float, self.count * self.stride), self.stride // PACKET
+        row = dr.arange(mi.UInt32, self.count) * packets
+        for q in range(packets):
             dr.scatter(buffer, mi.Vector4f(*adjoint[PACKET * q : PACKET * (q + 1)]), row + q)
         self.set_grad_in("buffer", buffer)
 

@@ -59,6 +59,12 @@ class _Depths:
     least: int
     most: int
 
+    @classmethod
+    def of(cls, depth: "mi.Float") -> "_Depths":
+        """Return those from the least ``depth`` to the greatest."""
+        bits = _bits(depth)
+        return cls(*(int(reduced(bits)[0]) for reduced in (dr.min, dr.max)))
+
     def wider(self) -> "_Depths":
         """Return the same, and an octave more to either side."""
         return _Depths(max(self.least - _OCTAVE, 0), min(self.most + _OCTAVE, _INFINITY))
@@ -67,7 +73,12 @@ class _Depths:
         """Return ``depth`` as a number of so many ``bits``; what lies beyond the ends is there."""
         drop = max((self.most - self.least).bit_length() - bits, 0)
         least, most, drop = (dr.opaque(mi.UInt32, number) for number in (self.least, self.most, drop))
-        return (dr.clip(dr.reinterpret_array(mi.UInt32, dr.fmax(depth, 0)), least, most) - least) >> drop
+        return (dr.clip(_bits(depth), least, most) - least) >> drop
+
+
+def _bits(depth):
+    """Those of depths, of 0 where one is not a number or negative."""
+    return dr.reinterpret_array(mi.UInt32, dr.fmax(depth, 0))
 
 
 @dataclass
@@ -222,13 +233,11 @@ def _sorted(lists, tiles, cutoffs) -> TileIntersections:
     return TileIntersections(ids, first, lists.count, tiles.seen)
 
 
-def _sort_keys(tile, depth, tiles):
-    """Numbers of 32 bits to sort by: the ``tile``, of so many ``tiles``, then the ``depth``, as finely as there are bits left: to
-    1e-4 and less, as a rule, which the blocks' own order mends. And what `_Depths` these are."""
-    bits = dr.reinterpret_array(mi.UInt32, dr.fmax(depth, 0))
-    depths = _Depths(*(int(reduced(bits)[0]) for reduced in (dr.min, dr.max)))
+def _sort_key(tile, depth, tiles, depths):
+    """One number of 32 bits to sort by: the ``tile``, of so many ``tiles``, then the ``depth``, one of these `_Depths`, as finely
+    as there are bits left: to 1e-4 and less, as a rule, which the blocks' own order mends."""
     room = 32 - max(tiles - 1, 1).bit_length()
-    return (tile << room) | depths.steps(depth, room), depths
+    return (tile << room) | depths.steps(depth, room)
 
 
 def _tile_intersections(projected, size, alpha_min) -> tuple[TileIntersections, _Depths]:
@@ -285,7 +294,7 @@ def _tile_intersections(projected, size, alpha_min) -> tuple[TileIntersections, 
     length = dr.zeros(mi.UInt32, n_tiles)
     dr.scatter_reduce(dr.ReduceOp.Add, length, mi.UInt32(1), tile)
     first = dr.prefix_reduce(dr.ReduceOp.Add, length, exclusive=True)
-    keys, depths = _sort_keys(tile, depth, n_tiles)
-    ids = dr.gather(mi.UInt32, surfel, dr.argsort(keys))
+    depths = _Depths.of(depth)
+    ids = dr.gather(mi.UInt32, surfel, dr.argsort(_sort_key(tile, depth, n_tiles, depths)))
     dr.eval(ids, first, length, seen)
     return TileIntersections(ids, first, length, seen), depths

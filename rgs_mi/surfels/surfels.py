@@ -63,6 +63,14 @@ class SurfelColumns:
         """Return the same surfels as columns that have been read."""
         return self
 
+    def joined(self) -> "Surfels":
+        """Return the same surfels with a tensor for each field, as `Surfels.split` takes them; not differentiated."""
+        with dr.suspend_grad():
+            n, shapes = len(self), {name: (len(self), self.channels(name)) for name in CHANNELS}
+            tensors = {name: mi.TensorXf(_rows_of(self.all_columns(name), n), shape) for name, shape in shapes.items()}
+            dr.eval(tensors)
+        return Surfels(**tensors, two_sided=self.two_sided, index=self.index)
+
     def with_columns(self, columns: "dict[str, list[mi.Float]]") -> "SurfelColumns":
         """Return the same surfels with other ``columns`` in place of those that these name."""
         own = {name: self.all_columns(name) for name in CHANNELS if name not in columns}
@@ -70,9 +78,12 @@ class SurfelColumns:
 
     def take(self, index: "mi.UInt32") -> "SurfelColumns":
         """Return the surfels ``index``, of which some may repeat; differentiable."""
-        of_scene = index if self.index is None else dr.gather(mi.UInt32, self.index, index)
         columns = {name: [dr.gather(mi.Float, column, index) for column in self.all_columns(name)] for name in CHANNELS}
-        return SurfelColumns(columns, self.two_sided, of_scene)
+        return SurfelColumns(columns, self.two_sided, self._of_scene(index))
+
+    def _of_scene(self, index):
+        """Which of a scene's surfels those with this ``index`` are."""
+        return index if self.index is None else dr.gather(mi.UInt32, self.index, index)
 
     def frames(self) -> "tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]":
         """Return (t_u, t_v, n), the unit tangents and normal of every surfel in world space, each of width N."""
@@ -133,6 +144,7 @@ class Surfels(SurfelColumns):
     curvature     K_uu, K_uv, K_vv: how the normal turns across the surfel, radians per √(s_u s_v); see `normal_derivatives`
     two_sided     whether surfels show from behind, with the normal turned to the camera (2DGS); one-sided ones, whose
                   normals point outwards, keep the far side of a closed object from bending its silhouette's normals
+    index         which of a scene's surfels they are (None: all, in their order)
     """
 
     centers: "mi.TensorXf"
@@ -146,6 +158,7 @@ class Surfels(SurfelColumns):
     delta_normal: "mi.TensorXf"
     curvature: "mi.TensorXf"
     two_sided: bool = True
+    index: "mi.UInt32 | None" = None
 
     def __len__(self) -> int:
         return self.centers.shape[0]
@@ -174,7 +187,7 @@ class Surfels(SurfelColumns):
         tensors = [getattr(self, name) for name in CHANNELS]
         values = iter(columns_of([t.array for t in tensors], [t.shape[1] for t in tensors]))
         columns = {name: [next(values) for _ in range(t.shape[1])] for name, t in zip(CHANNELS, tensors)}
-        return SurfelColumns(columns, self.two_sided)
+        return SurfelColumns(columns, self.two_sided, self.index)
 
     def _column(self, name, k):
         """Column ``k``. Each number is read once, so that the derivative needs no atomics, nor copies for each thread: these
@@ -192,7 +205,8 @@ class Surfels(SurfelColumns):
             source = dr.gather(mi.UInt32, index, entry // channels) * channels + entry % channels
             return mi.TensorXf(dr.gather(mi.Float, tensor.array, source, mode=dr.ReduceMode.Local), (count, channels))
 
-        return Surfels(**{name: rows(getattr(self, name)) for name in CHANNELS}, two_sided=self.two_sided)
+        fields = {name: rows(getattr(self, name)) for name in CHANNELS}
+        return Surfels(**fields, two_sided=self.two_sided, index=self._of_scene(index))
 
 
 def columns_of(arrays: "list[mi.Float]", channels: list[int]) -> "list[mi.Float]":
@@ -215,21 +229,22 @@ class _Split(dr.CustomOp):
         adjoint = list(self.grad_out())
         dr.eval(adjoint)  # otherwise every scatter below would compute them again
         columns = iter(adjoint)
-        self.set_grad_in("arrays", [self._join([next(columns) for _ in range(n)]) for n in self.channels])
+        self.set_grad_in("arrays", [_rows_of([next(columns) for _ in range(n)], self.rows) for n in self.channels])
 
     def _apply(self, arrays):
         row = dr.arange(mi.UInt32, self.rows)
         return [dr.gather(mi.Float, array, row * n + k) for array, n in zip(arrays, self.channels) for k in range(n)]
 
-    def _join(self, columns):
-        """The rows that have these ``columns``."""
-        rows, first = dr.empty(mi.Float, self.rows * len(columns)), dr.arange(mi.UInt32, self.rows) * len(columns)
-        for k, column in enumerate(columns):
-            dr.scatter(rows, column, first + k)
-        return rows
-
     def name(self):
         return "rgs_mi.surfels.Split"
+
+
+def _rows_of(columns, count):
+    """The ``count`` rows that have these ``columns``, one after the other; columns of one number have it in each row."""
+    rows, first = dr.empty(mi.Float, count * len(columns)), dr.arange(mi.UInt32, count) * len(columns)
+    for k, column in enumerate(columns):
+        dr.scatter(rows, column, first + k)
+    return rows
 
 
 def sh_order(channels: int) -> int:

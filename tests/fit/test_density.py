@@ -19,10 +19,9 @@ def model():
     m = Model.start(normals, normals, rng.uniform(0, 1, (N, 3)), np.full(N, 0.005), np.full((8, 16, 3), 0.5), np.eye(3), 2)
     m.set_rates(dict.fromkeys(m.names(), 1e-6))
     dr.set_grad(m[ENVIRONMENT], dr.ones(mi.TensorXf, m[ENVIRONMENT].shape))
-    floats = dr.width(m.rows.values)
-    m.step(
-        dr.arange(mi.UInt32, N), 1 + mi.Float(dr.arange(mi.UInt32, floats) // (floats // N))
-    )  # moments that tell the surfels apart
+    floats = dr.arange(mi.UInt32, dr.width(m.rows.values))
+    own = 1 + mi.Float(floats // (dr.width(floats) // N))  # moments that tell the surfels apart
+    m.step(dr.arange(mi.UInt32, N), own)
     return m
 
 

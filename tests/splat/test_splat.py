@@ -141,7 +141,8 @@ def test_tiles_come_before_depths():
     rng = np.random.default_rng(0)
     tile, depth = rng.integers(0, 3000, 20_000).astype(np.uint32), np.exp(rng.uniform(-4, 6, 20_000)).astype(np.float32)
     depth[5] = np.nan
-    order = dr.argsort(intersect._sort_keys(mi.UInt32(tile), mi.Float(depth), 3000)[0]).numpy()
+    depths = intersect._Depths.of(mi.Float(depth))
+    order = dr.argsort(intersect._sort_key(mi.UInt32(tile), mi.Float(depth), 3000, depths)).numpy()
     assert (np.diff(tile[order].astype(int)) >= 0).all()
     ahead, behind = depth[order][:-1], depth[order][1:]
     same = (np.diff(tile[order].astype(int)) == 0) & np.isfinite(ahead) & np.isfinite(behind)
