@@ -10,7 +10,7 @@ from ..datasets.rims import rim
 from ..datasets.types import Dataset, View
 from ..settings.settings import Settings, Stage
 
-_SURFELS, _A_MINUTE = 50_000, 5_000  # surfels at least, and a minute
+_SURFELS, _A_MINUTE, _MOST = 50_000, 5_000, 150_000  # surfels at least, and a minute, and at most by minutes alone
 _PHOTOGRAPHED, _UNMASKED = 15_000, 25_000  # a minute at most, of photographs, and of those without masks
 _MOST_UNMASKED = 250_000  # more need time that each is then seen too rarely in, and memory
 _FIRST = 25_000  # surfels to start with, at least
@@ -36,8 +36,9 @@ _OPEN = (
 def planned(settings: Settings, dataset: Dataset) -> Settings:
     """Return ``settings`` with numbers where they leave open what suits the photographs of ``dataset``:
 
-    - `density.max_surfels`: 50 000, or 5000 a minute; of photographs, which have relief, as many as one shows pixels of the
-      object, in the mean, if that is more; but 15 000 a minute at most, and 25 000, up to 250 000, where they have no masks;
+    - `density.max_surfels`: 50 000, or 5000 a minute up to 150 000; of photographs, which have relief, as many as one shows
+      pixels of the object, in the mean, if that is more; but 15 000 a minute at most, and 25 000, up to 250 000, where they
+      have no masks;
     - `initialization.surfels`: half of these, or three quarters where photographs have no masks; 25 000 at least;
     - `mask_rim`: of photographs, as far within their masks as the object begins (`rims.rim`);
     - `stages`: halves of halves down to the pixels of a square of some 220; from 20 % of the fit on all pixels, from 10 % on
@@ -49,7 +50,7 @@ def planned(settings: Settings, dataset: Dataset) -> Settings:
     if (most := density.max_surfels) is None:
         limit = min(_UNMASKED * minutes, _MOST_UNMASKED) if bare else _PHOTOGRAPHED * minutes
         shown = np.mean([_foreground(view) for view in dataset.train]) if dataset.photographed else 0
-        most = int(max(_SURFELS, _A_MINUTE * minutes, min(limit, shown)))
+        most = int(max(_SURFELS, min(_A_MINUTE * minutes, _MOST), min(limit, shown)))
     if first is None:
         first = min(max(_FIRST, most * 3 // 4 if bare else most // 2), most)
     edge = settings.mask_rim

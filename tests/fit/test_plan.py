@@ -38,7 +38,8 @@ def with_pixels(dataset, count, masked=False):
         (3, 4, True, False, 75_000),
         (10, 4, True, False, 83 * 75 * 16),
         (30, 8, True, False, 250_000),
-        (60, 8, True, False, 300_000),
+        (60, 8, True, False, 250_000),
+        (60, 8, False, True, 150_000),
     ],
 )
 def test_surfels_go_with_minutes_and_photographs_pixels(dataset, minutes, scale, photographed, masked, most):
