@@ -1,4 +1,5 @@
-"""What two processes do together, for `fit/test_ranks.py`: torchrun starts it; the first writes FILE, an npz."""
+"""What two processes do together, for `fit/test_ranks.py`: torchrun starts it with FILE, an npz that the first writes, and the
+number of steps that the model takes itself to have made."""
 
 import sys
 from dataclasses import replace
@@ -19,9 +20,11 @@ WEIGHTS = replace(SETTINGS.weights, normal=0.0, minimum_variation=0.0)
 LEARNED = replace(SETTINGS, cameras="learned", exposure="learned", cameras_start=0.0, density=GROWING, weights=WEIGHTS)
 
 
-def stepped(settings, ranks: Ranks, steps: int = STEPS) -> Fit:
+def stepped(settings, ranks: Ranks, before: int = 0) -> Fit:
+    """A fit after `STEPS`, to a model that has made so many ``before``."""
     fit = Fit(random_photographs(), model(), settings, 1.0, ranks=ranks)
-    for _ in range(steps):
+    fit.model.rows.steps = before
+    for _ in range(STEPS):
         fit.step()
     return fit
 
@@ -34,7 +37,7 @@ def _apart(one, other):
 if __name__ == "__main__":
     rgs_mi.set_variant()
     with started() as ranks, ranks.sharing_cores():
-        fit = stepped(LEARNED, ranks)
+        fit = stepped(LEARNED, ranks, int(sys.argv[2]))
         arrays, meta = fit.state()
         everyone = ranks.gather((arrays, meta["elapsed"], fit.psnr))
     if not ranks.rank:

@@ -16,6 +16,7 @@ from ..splat.intersect import in_view
 from ..splat.project import project
 from ..splat.tiles import Cutoffs
 from ..surfels.surfels import SH_0, SurfelColumns, Surfels
+from .ranks import Ranks
 from .rows import EPSILON, Rows
 
 #: Unconstrained parameters, one row per surfel.
@@ -198,11 +199,11 @@ class Model:
 
     # ---- Steps ----
 
-    def gradients(self, every: bool = False) -> "tuple[mi.UInt32, mi.Float]":
-        """Return (index, gradient) of the surfels that were taken since the last call, or of ``every`` one, as `step` wants
-        them."""
+    def gradients(self, ranks: Ranks = Ranks()) -> "tuple[mi.UInt32, mi.Float]":
+        """Return (index, gradient) of the surfels that were taken since the last call in any of ``ranks``, as `step` wants them
+        but for the mean over these."""
         taken, self._taken = self._taken, []
-        return self.rows.together([(index, dr.grad(rows), once) for index, rows, once in taken], every)
+        return self.rows.together([(index, dr.grad(rows), once) for index, rows, once in taken], ranks)
 
     def set_rates(self, rates: dict[str, float]) -> None:
         """Set the learning rate of each of the parameters `names`."""
