@@ -1,5 +1,4 @@
-"""What two processes do together, for `fit/test_ranks.py`: torchrun starts it with FILE, an npz that the first writes, and the
-number of steps that the model takes itself to have made."""
+"""What two processes do together, for `fit/test_ranks.py`: torchrun starts it; the first writes FILE, an npz."""
 
 import sys
 from dataclasses import replace
@@ -20,11 +19,9 @@ WEIGHTS = replace(SETTINGS.weights, normal=0.0, minimum_variation=0.0)
 LEARNED = replace(SETTINGS, cameras="learned", exposure="learned", cameras_start=0.0, density=GROWING, weights=WEIGHTS)
 
 
-def stepped(settings, ranks: Ranks, before: int = 0) -> Fit:
-    """A fit after `STEPS`, to a model that has made so many ``before``."""
+def stepped(settings, ranks: Ranks, steps: int = STEPS) -> Fit:
     fit = Fit(random_photographs(), model(), settings, 1.0, ranks=ranks)
-    fit.model.rows.steps = before
-    for _ in range(STEPS):
+    for _ in range(steps):
         fit.step()
     return fit
 
@@ -37,7 +34,7 @@ def _apart(one, other):
 if __name__ == "__main__":
     rgs_mi.set_variant()
     with started() as ranks, ranks.sharing_cores():
-        fit = stepped(LEARNED, ranks, int(sys.argv[2]))
+        fit = stepped(LEARNED, ranks)
         arrays, meta = fit.state()
         everyone = ranks.gather((arrays, meta["elapsed"], fit.psnr))
     if not ranks.rank:

@@ -52,10 +52,10 @@ class Statistics:
         """Return all of them."""
         return list(vars(self).values())
 
-    def merge(self, index: "mi.UInt32", sums: "Sequence[mi.Float]") -> None:
-        """Add another's `sums` of the surfels ``index``, none of them twice."""
-        for total, value in zip(self.sums(), sums):
-            dr.scatter_reduce(dr.ReduceOp.Add, total, value, index, mode=dr.ReduceMode.NoConflicts)
+    def merge(self, sums: "Sequence[mi.Float]") -> None:
+        """Add another's `sums`, of the same surfels."""
+        for name, value in zip(vars(self), sums):
+            setattr(self, name, getattr(self, name) + value)
         dr.eval(self.sums())
 
     def mean(self, name: str) -> np.ndarray:

@@ -16,7 +16,6 @@ from ..splat.intersect import in_view
 from ..splat.project import project
 from ..splat.tiles import Cutoffs
 from ..surfels.surfels import SH_0, SurfelColumns, Surfels
-from .ranks import Ranks
 from .rows import EPSILON, Rows
 
 #: Unconstrained parameters, one row per surfel.
@@ -199,11 +198,11 @@ class Model:
 
     # ---- Steps ----
 
-    def gradients(self, ranks: Ranks = Ranks()) -> "tuple[mi.UInt32, mi.Float]":
-        """Return (index, gradient) of the surfels that were taken since the last call in any of ``ranks``, as `step` wants them
-        but for the mean over these."""
+    def gradients(self, every: bool = False) -> "tuple[mi.UInt32, mi.Float]":
+        """Return (index, gradient) of the surfels that were taken since the last call, or of ``every`` one, as `step` wants
+        them."""
         taken, self._taken = self._taken, []
-        return self.rows.together([(index, dr.grad(rows), once) for index, rows, once in taken], ranks)
+        return self.rows.together([(index, dr.grad(rows), once) for index, rows, once in taken], every)
 
     def set_rates(self, rates: dict[str, float]) -> None:
         """Set the learning rate of each of the parameters `names`."""

@@ -66,17 +66,6 @@ class Ranks:
         ordered = iter(means)
         return [None if array is None else next(ordered) for array in arrays]
 
-    def largest(self, array: "mi.UInt8") -> "mi.UInt8":
-        """Return the largest over all processes of each number of ``array``, which is as long everywhere."""
-        if self.size == 1:
-            return array
-        import torch.distributed
-
-        dr.eval(array)
-        with _together(self):
-            torch.distributed.all_reduce(shared := array.torch(), torch.distributed.ReduceOp.MAX)
-        return mi.UInt8(shared)
-
     def gather(self, value: T) -> list[T]:
         """Return what each process gives as ``value``, in their order; anything that can be pickled."""
         if self.size == 1:

@@ -20,7 +20,6 @@ import numpy as np
 
 from ..core.arrays import as_float
 from ..splat.hit import PACKET, FetchAll, padded
-from .ranks import Ranks
 
 _BETA_1, _BETA_2 = 0.9, 0.999
 _RHO = _BETA_1 / math.sqrt(_BETA_2)
@@ -78,19 +77,18 @@ class Rows:
         return {name: [next(columns) for _ in range(n)] for name, n in self._channels.items()}
 
     def together(
-        self, parts: "Sequence[tuple[mi.UInt32, mi.Float, bool]]", ranks: Ranks = Ranks()
+        self, parts: "Sequence[tuple[mi.UInt32, mi.Float, bool]]", every: bool = False
     ) -> "tuple[mi.UInt32, mi.Float]":
-        """Return (index, gradient): the rows of which any of ``parts`` has gradients, in any of ``ranks``, or every one in the
-        first steps, and their sums here, row by row. A part is (index, gradient, whether no row is in it twice). What overflowed
-        counts as zero."""
+        """Return (index, gradient): the rows of which any of ``parts`` has gradients, or ``every`` one, as in the first steps,
+        and their sums, row by row. A part is (index, gradient, whether no row is in it twice). What overflowed counts as zero."""
         n = len(self)
-        if self.steps < _YOUNG:
+        if every or self.steps < _YOUNG:
             index = place = dr.arange(mi.UInt32, n)
         else:
-            found, place = dr.zeros(mi.UInt8, n), dr.empty(mi.UInt32, n)
+            found, place = dr.zeros(mi.UInt32, n), dr.empty(mi.UInt32, n)
             for rows, _, _ in parts:
-                dr.scatter(found, mi.UInt8(1), rows)
-            index = dr.compress(ranks.largest(found) > 0)
+                dr.scatter(found, mi.UInt32(1), rows)
+            index = dr.compress(found > 0)
             dr.scatter(place, dr.arange(mi.UInt32, dr.width(index)), index)
         total = dr.zeros(mi.Float, max(dr.width(index), 1) * self._stride)
         for rows, gradient, once in parts:

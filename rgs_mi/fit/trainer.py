@@ -303,17 +303,17 @@ class Fit:
         statistics = Statistics(len(self.model))
         measured = [self._view(i, lighting, 1 / len(views), statistics) for i in views]
         error = dr.mean([m.pop("error") for m in measured])
-        index, gradient = self.model.gradients(self.ranks)
+        index, gradient = self.model.gradients(every=self.ranks.size > 1)
         gradients = [dr.grad(leaf) for leaf in leaves]
         gradients = [dr.select(dr.isfinite(g), g, 0) for g in gradients]  # one overflow must not end a fit
         light = None
         if lighting:  # whose maps come first of what it learns
             del shared[0]
             light = self._light.gather(self.step_number, gradients.pop(0))
-        sums = [dr.gather(mi.Float, total, index) for total in statistics.sums()]
+        sums = statistics.sums()
         gradient, *means, error, light = self.ranks.mean([gradient, *gradients, *sums, error, light])
         gradients, sums = means[: -len(sums)], means[-len(sums) :]
-        self.density.statistics.merge(index, [mean * self.ranks.size for mean in sums])
+        self.density.statistics.merge([mean * self.ranks.size for mean in sums])
         measured.append({"error": error})
         if light is not None:
             self._light.pass_on(self.model, light)

@@ -7,7 +7,6 @@ import pytest
 
 from rgs_mi.core.camera import Camera
 from rgs_mi.fit.model import SURFEL_PARAMETERS, Model
-from rgs_mi.fit.ranks import Ranks
 from rgs_mi.fit.rows import EPSILON, Rows
 from rgs_mi.splat.gbuffer import render_gbuffer
 from rgs_mi.splat.intersect import isect_tiles
@@ -116,21 +115,9 @@ def test_a_state_goes_on_as_if_it_had_not_been_read():
         assert not np.array_equal(both.rows.numpy(name), fields()[name])
 
 
-class Other(Ranks):
-    """A process beside one that sees rows 5 and 7."""
-
-    def largest(self, array):
-        found = array.numpy().copy()
-        found[[5, 7]] = 1
-        return mi.UInt8(found)
-
-
-@pytest.mark.parametrize(
-    "ranks, steps, expected_rows",
-    [(Ranks(), 200, [1, 2, 5, 9, 30]), (Other(), 200, [1, 2, 5, 7, 9, 30]), (Ranks(), 199, list(range(N)))],
-)
-def test_gradients_of_several_views_come_together(ranks, steps, expected_rows):
-    """Of the rows that they have, those too that another process has, and of all in the first steps."""
+@pytest.mark.parametrize("every, steps", [(False, 200), (True, 200), (False, 199)])
+def test_gradients_of_several_views_come_together(every, steps):
+    """Of the rows that they have, of all rows where each process is to have all, and in the first steps."""
     rng, rows = np.random.default_rng(6), Rows(fields(), steps=steps)
     parts = []
     for index, once in (([2, 5, 9], True), ([5, 9, 30], True), ([9, 9, 9, 1], False)):
@@ -139,8 +126,8 @@ def test_gradients_of_several_views_come_together(ranks, steps, expected_rows):
     expected = np.zeros((N, 16))
     for index, gradient, _ in parts:
         np.add.at(expected, index, np.nan_to_num(gradient))
-    index, total = rows.together([(mi.UInt32(i), mi.Float(g.ravel()), once) for i, g, once in parts], ranks)
-    assert index.numpy().tolist() == expected_rows
+    index, total = rows.together([(mi.UInt32(i), mi.Float(g.ravel()), once) for i, g, once in parts], every)
+    assert index.numpy().tolist() == (list(range(N)) if every or steps < 200 else [1, 2, 5, 9, 30])
     np.testing.assert_allclose(total.numpy().reshape(-1, 16), expected[index.numpy()], rtol=1e-5, atol=1e-6)
 
 
