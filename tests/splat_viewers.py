@@ -1,9 +1,9 @@
 """How exported splats of a run look in Babylon.js, against our own renderings of the same views.
 
-``python tests/splat_viewers.py RUN [--views 10] [--size W] [--data DIR] [--out DIR]`` exports PLY and GLB, draws them in a
-headless Chromium, and prints the PSNR of each view over white. Views are the run's own test views, or, where ``--data``
-names the capture that it was fitted to, photographs of that: cameras that baking has not seen. ``--out``
-keeps the pairs of pictures.
+``python tests/splat_viewers.py RUN [--views 10] [--size W] [--refine MINUTES] [--data DIR] [--out DIR]`` exports PLY and GLB,
+draws them in a headless Chromium, and prints the PSNR of each view over white. Views are the run's own test views, which
+refining has not seen, or, where ``--data`` names the capture that it was fitted to, photographs of that: cameras that baking
+has not seen. ``--out`` keeps the pairs of pictures.
 """
 
 import argparse
@@ -22,6 +22,7 @@ def main():
     parser.add_argument("run", type=Path)
     parser.add_argument("--views", type=int, default=10)
     parser.add_argument("--size", type=int)
+    parser.add_argument("--refine", type=float)
     parser.add_argument("--data", type=Path)
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
@@ -45,7 +46,7 @@ def main():
     ours = [rendered(scene, camera) for camera in cameras]
     with tempfile.TemporaryDirectory() as folder:
         for to, rotation in (("splat", np.eye(3)), ("gltf-splat", to_y_up(scene, path))):
-            (file,) = export(args.run, to, out=folder, quiet=True)
+            (file,) = export(args.run, to, out=folder, refine=args.refine, quiet=True)
             with babylon(file) as draw:
                 theirs = [draw(camera, rotation) for camera in cameras]
             scores = [psnr(a, b) for a, b in zip(theirs, ours)]
@@ -55,12 +56,12 @@ def main():
 
 
 def rendered(scene, camera):
-    """Our own rendering over white, [H, W, 3] display values."""
+    """Our own rendering over white, as `rgs-mi render` makes it, [H, W, 3] display values."""
     import mitsuba as mi
 
     from rgs_mi.export.render import sensor_dict, straight
 
-    image = straight(np.array(mi.render(scene, sensor=mi.load_dict(sensor_dict(camera)), spp=4)))
+    image = straight(np.array(mi.render(scene, sensor=mi.load_dict(sensor_dict(camera, scene)), spp=4)))
     return image[..., :3] * image[..., 3:] + 1 - image[..., 3:]
 
 

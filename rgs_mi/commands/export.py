@@ -8,6 +8,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from ..core.camera import Camera
 from ..core.errors import UserError
 from ..core.files import make_folder
 from ..core.scene_files import load_scene
@@ -17,7 +18,8 @@ from ..export.mesh.surface import PACKAGES, packages
 from ..export.mitsuba_scene import SCENE
 from ..report.results import finished, origin_of
 from ..shading.environment import Environment
-from .export_mesh import export_mesh
+from . import export_splats
+from .export_mesh import export_mesh, training_photographs
 
 FORMATS = ("splat", "gltf-splat", "usd", "mesh")
 _RIGID = 1e-4  # how far an environment's ``to_world`` may be from a rotation
@@ -34,8 +36,10 @@ def export(
     quiet: bool = False,
 ) -> list[Path]:
     """Write the finished fit in the folder ``run`` in the format ``to``, one of `FORMATS`, into the folder ``out`` (None:
-    ``export/FORMAT`` in ``run``), and return the paths of its files. ``kernel`` is that of `usd_splat.write` (None: its default),
-    ``refine`` (minutes; None: not at all) and ``data`` are those of `export_mesh`.
+    ``export/FORMAT`` in ``run``), and return the paths of its files. ``kernel`` is that of `usd_splat.write` (None: its default).
+    With ``refine`` (minutes; None: not at all) a mesh's textures are fitted that long to the training photographs
+    (`export_mesh`), and splats to renderings from between their cameras (`export_splats`); they are in the folder ``data``
+    (None: where metrics.json says).
 
     Raises: UserError for an unknown format, a folder that holds no finished run, a run without surfels, and where a package
     is missing or a file can't be written.
@@ -46,9 +50,10 @@ def export(
         raise UserError(f"--kernel {kernel}: only the format 'usd' has kernels: leave it out, or say --to usd")
     if kernel is not None and kernel not in usd_splat.KERNELS:
         raise UserError(f"--kernel {kernel}: unknown kernel: choose one of {', '.join(usd_splat.KERNELS)}")
-    if to != "mesh" and (refine is not None or data is not None):
-        given = "data" if refine is None else "refine"
-        raise UserError(f"--{given}: only the format 'mesh' takes it: leave it out, or say --to mesh")
+    if to != "mesh" and data is not None and refine is None:
+        raise UserError(
+            "--data: splats are made of a run alone, unless they are refined: leave it out, or add --refine MINUTES"
+        )
     if refine is not None and not 0 < refine < math.inf:
         raise UserError(f"--refine {refine:g}: needs a number of minutes above 0")
     if to == "usd":
@@ -64,6 +69,9 @@ def export(
     if to == "mesh":
         return export_mesh(run, path, scene, y_up, origin, folder, refine, data, quiet)
     splats = replace(bake(scene, path, quiet), origin=origin)
+    if refine:
+        seen = [p.camera for p in training_photographs(run, data)] or [Camera.from_sensor(s) for s in scene.sensors()]
+        splats = export_splats.refine(splats, scene, path, seen, refine, quiet)
     if to == "splat":
         return splat_ply.write(folder, splats)
     splats = splats.rotated(y_up)

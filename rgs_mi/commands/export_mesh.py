@@ -52,7 +52,7 @@ def export_mesh(
     if minutes and (not mapped or lighting is None or lighting.turntable is not None):
         raise UserError(f"{path}: has no environment map that stands still, which --refine needs: leave it out")
     _tell_what_is_lost(path, scene, lighting)
-    photographs = _photographs(run, data, needed=bool(minutes))
+    photographs = training_photographs(run, data, needed=bool(minutes))
     seen = [p.camera for p in photographs] or [Camera.from_sensor(sensor) for sensor in scene.sensors()]
     lit = lighting is not None and lighting.lit
     eta = surfels_of(scene, path).eta
@@ -86,9 +86,10 @@ def _tell_what_is_lost(path, scene, lighting):
             print(f"{path}: {words}", file=sys.stderr)
 
 
-def _photographs(run, data, needed) -> list[Photograph]:
-    """The training photographs of a ``run`` with their cameras, as learned where they were; none where they are gone and not
-    ``needed``. Raises: UserError where they are needed, or were asked for."""
+def training_photographs(run: Path, data: str | Path | None, needed: bool = False) -> list[Photograph]:
+    """Return the training photographs of a ``run``, in the folder ``data`` (None: where metrics.json says), with their cameras,
+    as learned where they were; none where they are gone and not ``needed``. Raises: UserError where they are needed, or
+    were asked for."""
     try:
         folder, longest = results.photographs_of(run)
         folder = data or folder
@@ -98,7 +99,7 @@ def _photographs(run, data, needed) -> list[Photograph]:
     except UserError:
         if needed or data is not None:
             raise
-        print(f"{run}: its photographs are gone: the mesh is what the scene's sensors see", file=sys.stderr)
+        print(f"{run}: its photographs are gone: what is exported is what the scene's sensors see", file=sys.stderr)
         return []
     learned = cameras.read_training(run, views)
     if learned is None:

@@ -49,6 +49,11 @@ class Photograph:
         """The part of the window's pixels that the tile has."""
         return float(np.prod(self.camera.size) / np.prod(self.window))
 
+    @property
+    def of_image(self) -> float:
+        """The part of the photograph's pixels that the window has."""
+        return float(np.prod(self.window) / np.prod(self.size))
+
 
 class Photographs:
     """The training photographs of one pyramid level as the losses want them: display space, over the background, and

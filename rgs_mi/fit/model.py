@@ -1,7 +1,7 @@
 """What a fit learns: surfels, environment and shader in unconstrained form, and the optimizer that moves them."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import drjit as dr
 import mitsuba as mi
@@ -13,7 +13,7 @@ from ..shading.environment import Environment
 from ..shading.room import SIDES, Room
 from ..shading.shader import Shader, initial_weights
 from ..splat.intersect import in_view
-from ..splat.project import project
+from ..splat.project import Projected, project
 from ..splat.tiles import Cutoffs
 from ..surfels.surfels import SH_0, SurfelColumns, Surfels
 from .rows import EPSILON, Rows
@@ -164,11 +164,14 @@ class Model:
         then has."""
         return _Scene(self, sh_order)
 
-    def in_view(self, camera: Camera, cutoffs: Cutoffs) -> "mi.UInt32":
-        """Return which surfels ``camera`` sees, as far as none hides another, in their order; the first where it sees none."""
+    def in_view(
+        self, camera: Camera, cutoffs: Cutoffs, projected: "Callable[[SurfelColumns, Camera], Projected]" = project
+    ) -> "mi.UInt32":
+        """Return which surfels ``camera`` sees, as they are ``projected``, as far as none hides another, in their order; the
+        first where it sees none."""
         with dr.suspend_grad():
             columns = self._columns(self.rows.values, 0) | {"curvature": [mi.Float(0)] * 3}
-            index = dr.compress(in_view(project(SurfelColumns(columns, self.two_sided), camera), camera.size, cutoffs))
+            index = dr.compress(in_view(projected(SurfelColumns(columns, self.two_sided), camera), camera.size, cutoffs))
         return index if dr.width(index) else dr.zeros(mi.UInt32, 1)
 
     def take(self, index: "mi.UInt32", sh_order: int, once: bool) -> SurfelColumns:

@@ -83,9 +83,8 @@ class Objective:
         weight = dr.opaque(mi.Float, consistency)
         terms["consistency"] = weight * losses.depth_normal_consistency(image.gbuffer, samples.camera)
         # These are means over the whole photograph, of which tiles give an estimate
-        part_of_image = photo.window[0] * photo.window[1] / (photo.size[0] * photo.size[1])
-        terms = {name: part_of_image * term for name, term in terms.items()}
-        error = dr.mean(dr.mean(dr.square(dr.detach(rendered) - photo.color))) * part_of_image
+        terms = {name: photo.of_image * term for name, term in terms.items()}
+        error = dr.mean(dr.mean(dr.square(dr.detach(rendered) - photo.color))) * photo.of_image
         regional, reflective = self._regional(image.gbuffer, samples, step)
         terms = {f"loss.{name}": term for name, term in (terms | regional).items()}
         return ViewLoss(terms, film.spread(dr.detach(photometric), size), error, reflective)

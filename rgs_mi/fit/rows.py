@@ -140,6 +140,18 @@ class Rows:
         rates = np.repeat([self.rates[name] for name in self._channels], list(self._channels.values()))
         return dr.gather(mi.Vector4f, as_float(np.pad(rates * correction, (0, self._stride - len(rates)))), column)
 
+    def clip(self, most: Mapping[str, float]) -> None:
+        """Keep the parameters of these names from going beyond ± so ``most``, in all rows as they are kept."""
+        bounds = np.full(self._stride, np.finfo(np.float32).max)
+        for name, bound in most.items():
+            bounds[self._slice(name)] = bound
+        packet = dr.arange(mi.UInt32, dr.width(self.values) // PACKET)
+        bound = dr.gather(mi.Vector4f, as_float(bounds), packet % (self._stride // PACKET))
+        clipped = dr.clip(dr.gather(mi.Vector4f, self.values, packet), -bound, bound)
+        dr.eval(clipped)  # it could not be written in place of what it is still computed from
+        dr.scatter(self.values, clipped, packet)
+        dr.eval(self.values)
+
     def catch_up(self) -> None:
         """Bring all rows to where they are by now."""
         if not self._resting:

@@ -2,7 +2,7 @@
 
 Per pixel, over its block's surfels front to back, with T_1 = 1:
 
-    α_i = o_i exp(−½ min(u² + v², LOW_PASS |δ|²)),   w_i = T_i α_i,   T_{i+1} = T_i − w_i,
+    α_i = o_i exp(−½ min(u² + v², low_pass |δ|²)),   w_i = T_i α_i,   T_{i+1} = T_i − w_i,
     image = Σ_i w_i (features_i, t_i, 1), and where asked t_i²                                     (2)
 
 The normal among the features is n_i + u ∂n_i/∂u + v ∂n_i/∂v, with the derivatives of `Surfels.normal_derivatives`;
@@ -33,19 +33,25 @@ _DERIVATIVES = 6  # floats
 
 @dataclass(frozen=True)
 class Layout:
-    """How ``features`` channels lie in a projected Gaussian's row (ten geometric numbers, the features, the normal's
-    derivatives, padded) and in a pixel (features, depth, alpha, with ``squares`` also depth², padded), and the constants of
-    the walk."""
+    """How ``features`` channels lie in a projected Gaussian's row (ten geometric numbers, the features, the derivatives of the
+    normal, if that is among them, padded) and in a pixel (features, depth, alpha, with ``squares`` also depth², padded), and
+    the constants of the walk. ``normals`` says whether the fourth to sixth feature are the normal."""
 
     size: tuple[int, int]
     features: int
     cutoffs: Cutoffs = Cutoffs()
     squares: bool = False
+    normals: bool = True
 
     @property
     def gaussian(self) -> int:
         """Floats in a projected Gaussian's row."""
-        return padded(len(GEOMETRY) + self.features + _DERIVATIVES)
+        return padded(self.columns)
+
+    @property
+    def columns(self) -> int:
+        """Floats in a projected Gaussian's row, without padding."""
+        return len(GEOMETRY) + self.features + _DERIVATIVES * self.normals
 
     @property
     def pixel(self) -> int:
@@ -59,7 +65,9 @@ class Layout:
 
 
 def _normal_derivatives(gaussian, layout):
-    """(∂n/∂u, ∂n/∂v) of a projected Gaussian, a list each."""
+    """(∂n/∂u, ∂n/∂v) of a projected Gaussian, a list each; empty ones without normals."""
+    if not layout.normals:
+        return [], []
     end = len(GEOMETRY) + layout.features
     return gaussian[end : end + 3], gaussian[end + 3 : end + _DERIVATIVES]
 
@@ -161,7 +169,7 @@ class Composite(dr.CustomOp):
             for k, (x, y) in enumerate(centers):
                 hit = Hit(r, x, y, layout.cutoffs)
                 w = T[k] * hit.alpha
-                g, d_normal = adjoint[k][n + 1], [w * a for a in adjoint[k][_NORMAL : _NORMAL + 3]]
+                g, d_normal = adjoint[k][n + 1], [w * a for a in adjoint[k][_NORMAL : _NORMAL + 3 * layout.normals]]
                 for a, value in zip(adjoint[k], [*_features(r, layout, hit.offset), hit.t]):
                     g = dr.fma(a, value, g)
                 d_t = adjoint[k][n]
@@ -187,7 +195,7 @@ class Composite(dr.CustomOp):
 
         dr.eval(_walk(self.isects, layout, lambda pixels: rest, body))
         rows = fetch(gradient, dr.arange(mi.UInt32, self.surfels), layout.gaussian)
-        self.set_grad_in("columns", rows[: len(GEOMETRY) + n + _DERIVATIVES])
+        self.set_grad_in("columns", rows[: layout.columns])
 
     def forward(self) -> None:
         layout, n = self.layout, self.layout.features
@@ -219,10 +227,10 @@ class Composite(dr.CustomOp):
 
 def composite(projected: Projected, features: "list[mi.Float]", isects: TileIntersections, layout: Layout) -> "mi.Float":
     """Return the image of (2), of width H · W · layout.pixel, row-major, each pixel (features, depth, alpha, perhaps depth²,
-    padding). ``features`` have width N, the normal's three come after the first three. Differentiable in the projected
-    Gaussians, in both modes."""
-    normal_derivatives = [value for derivative in projected.normal_derivatives for value in derivative]
-    return dr.custom(Composite, projected.geometry + features + normal_derivatives, isects, layout)
+    padding). ``features`` have width N; the normal's three come after the first three, if ``layout`` says that they do.
+    Differentiable in the projected Gaussians, in both modes."""
+    derivatives = [value for derivative in projected.normal_derivatives for value in derivative] if layout.normals else []
+    return dr.custom(Composite, projected.geometry + features + derivatives, isects, layout)
 
 
 def median_depth(projected: Projected, isects: TileIntersections, size: tuple[int, int]) -> "tuple[mi.Float, mi.Float]":

@@ -7,7 +7,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .project import GEOMETRY
-from .tiles import BLOCK, LOW_PASS, Cutoffs
+from .tiles import BLOCK, Cutoffs
 
 PACKET = 4  # floats per gather and scatter
 HORIZON = 1e-5  # least h of (1): beyond it a ray runs along the surfel's plane, or meets it behind the camera
@@ -88,14 +88,14 @@ class Hit:
 
     def __init__(self, gaussian: "Sequence[mi.Float]", x: "mi.Float", y: "mi.Float", cutoffs: Cutoffs) -> None:
         X, Y, A_x, A_y, B_x, B_y, N_x, N_y, z, opacity = gaussian[: len(GEOMETRY)]
-        self.dx, self.dy = x - X, y - Y
+        self.dx, self.dy, self.low_pass = x - X, y - Y, cutoffs.low_pass
         h = 1 + N_x * self.dx + N_y * self.dy
         in_front = h > HORIZON
         self.inv_h = dr.rcp(dr.select(in_front, h, 1))
         self.u = (A_x * self.dx + A_y * self.dy) * self.inv_h
         self.v = (B_x * self.dx + B_y * self.dy) * self.inv_h
         on_plane = dr.select(in_front, self.u * self.u + self.v * self.v, dr.largest(mi.Float))
-        on_screen = LOW_PASS * (self.dx * self.dx + self.dy * self.dy)
+        on_screen = cutoffs.low_pass * (self.dx * self.dx + self.dy * self.dy)
         self.on_plane = on_plane <= on_screen  # else the low-pass decides, and the depth is the center's
         self.offset = [dr.select(self.on_plane, value, 0) for value in (self.u, self.v)]  # where normals are taken
         self.gauss = dr.exp(-0.5 * dr.minimum(on_plane, on_screen))
@@ -119,7 +119,7 @@ class Hit:
             h, u, v = (offset + a * dx + b * dy for offset, a, b in ((1, N_x, N_y), (0, A_x, A_y), (0, B_x, B_y)))
             rho = u * u + v * v
             near = (h > HORIZON) & (rho < reach * h * h)
-            seen |= near | (LOW_PASS * (dx * dx + dy * dy) < reach)
+            seen |= near | (cutoffs.low_pass * (dx * dx + dy * dy) < reach)
             alphas.append(dr.select(near, most * dr.square(dr.square(dr.maximum(1 - eighth * rho, 0))), 0))
         return self.t, seen, alphas
 
@@ -136,7 +136,7 @@ class Hit:
             for value, d_value in zip((self.u, self.v), d_offset)
         )
         d_h = -(d_u * self.u + d_v * self.v) - plane(d_t * self.t * self.inv_h)
-        d_screen = dr.select(self.on_plane, 0, 2 * LOW_PASS * d_rho)
+        d_screen = dr.select(self.on_plane, 0, 2 * self.low_pass * d_rho)
         d_dx = d_u * A_x + d_v * B_x + d_h * N_x + d_screen * self.dx
         d_dy = d_u * A_y + d_v * B_y + d_h * N_y + d_screen * self.dy
         return [
@@ -161,7 +161,7 @@ class Hit:
         h_ = N_x_ * self.dx + N_y_ * self.dy - N_x * X_ - N_y * Y_
         u_ = (A_x_ * self.dx + A_y_ * self.dy - A_x * X_ - A_y * Y_ - self.u * h_) * self.inv_h
         v_ = (B_x_ * self.dx + B_y_ * self.dy - B_x * X_ - B_y * Y_ - self.v * h_) * self.inv_h
-        rho_ = dr.select(self.on_plane, 2 * (self.u * u_ + self.v * v_), -2 * LOW_PASS * (self.dx * X_ + self.dy * Y_))
+        rho_ = dr.select(self.on_plane, 2 * (self.u * u_ + self.v * v_), -2 * self.low_pass * (self.dx * X_ + self.dy * Y_))
         alpha_ = dr.select(self.kept & ~self.clamped, opacity_ * self.gauss - 0.5 * self.alpha * rho_, 0)
         on_plane = lambda value, otherwise=0: dr.select(self.on_plane, value, otherwise)
         return alpha_, on_plane((z_ - self.t * h_) * self.inv_h, z_), [on_plane(u_), on_plane(v_)]

@@ -19,7 +19,7 @@ import mitsuba as mi
 
 from .hit import Hit, fetch, pack, padded, reach
 from .project import Projected
-from .tiles import BLOCK, LOW_PASS, TILE, Cutoffs, block_pixels, tile_grid
+from .tiles import BLOCK, TILE, Cutoffs, block_pixels, tile_grid
 
 FAR = 1e6  # pixels: beyond every image
 SORT_RADIUS = 3.0  # standard deviations
@@ -118,11 +118,11 @@ class _Outline:
         )
 
 
-def _outline(geometry, alpha_min):
+def _outline(geometry, cutoffs):
     """The outline of every surfel, and whether it has one. A plane that reaches behind the camera inside its r has no
     ellipse but an unbounded conic: such a surfel (rare: the camera is almost inside it) is listed everywhere."""
     x, y, A_x, A_y, B_x, B_y, N_x, N_y, _, opacity = geometry
-    r2 = 2 * dr.log(dr.maximum(opacity / alpha_min, 1))
+    r2 = 2 * dr.log(dr.maximum(opacity / cutoffs.alpha_min, 1))
     # (A·δ)² + (B·δ)² = r² (1 + N·δ)², written as (δ−e)ᵀ Q (δ−e) = k
     q00, q11 = A_x * A_x + B_x * B_x - r2 * N_x * N_x, A_y * A_y + B_y * B_y - r2 * N_y * N_y
     q01 = A_x * A_y + B_x * B_y - r2 * N_x * N_y
@@ -135,7 +135,7 @@ def _outline(geometry, alpha_min):
     e_x, e_y, i01 = (ellipse(v, 0) for v in (e_x, e_y, i01))
     i00, i11, k = ellipse(i00, 1), ellipse(i11, 1), ellipse(k, FAR * FAR)
     return _Outline(
-        x + e_x, y + e_y, dr.sqrt(k * i00), dr.sqrt(k * i11), i00, i01, i11, k, x, y, dr.sqrt(r2 / LOW_PASS)
+        x + e_x, y + e_y, dr.sqrt(k * i00), dr.sqrt(k * i11), i00, i01, i11, k, x, y, dr.sqrt(r2 / cutoffs.low_pass)
     ), r2 > 0
 
 
@@ -159,7 +159,7 @@ def isect_tiles(projected: Projected, size: tuple[int, int], cutoffs: Cutoffs) -
     """Return the surfels that every block of an image of ``size`` (width, height) pixels sees, in the order in which it meets
     them; blocks are in the order of `block_pixels`. Not differentiated."""
     with dr.suspend_grad():
-        tiles, depths = _tile_intersections(projected, size, cutoffs.alpha_min)
+        tiles, depths = _tile_intersections(projected, size, cutoffs)
         return _sorted(_seen_by_blocks(projected, size, tiles, depths, cutoffs), tiles, cutoffs)
 
 
@@ -167,7 +167,7 @@ def in_view(projected: Projected, size: tuple[int, int], cutoffs: Cutoffs) -> "m
     """Return which surfels an image of ``size`` (width, height) pixels shows, or one that is larger by a tile on each side, as
     far as no surfel hides another. Not differentiated."""
     with dr.suspend_grad():
-        outline, drawn = _outline(projected.geometry, cutoffs.alpha_min)
+        outline, drawn = _outline(projected.geometry, cutoffs)
         for n, margin, e, h, center in zip(
             size, TILE, (outline.ex, outline.ey), (outline.hx, outline.hy), (outline.x, outline.y)
         ):
@@ -240,11 +240,11 @@ def _sort_key(tile, depth, tiles, depths):
     return (tile << room) | depths.steps(depth, room)
 
 
-def _tile_intersections(projected, size, alpha_min) -> tuple[TileIntersections, _Depths]:
+def _tile_intersections(projected, size, cutoffs) -> tuple[TileIntersections, _Depths]:
     """The surfels of every tile, sorted by `_depth_at_tile`, and what `_Depths` these are. Call it where gradients are
     suspended."""
     columns, rows = tile_grid(size)
-    outline, drawn = _outline(projected.geometry, alpha_min)
+    outline, drawn = _outline(projected.geometry, cutoffs)
     drawn &= projected.visible
     # A pixel belongs to the surfel when its centre does: tile row r holds the centres TILE[1] r + 1/2 …
     index = lambda v, n, t: mi.Int32(dr.clip(dr.floor((v - 0.5) / t), -1, n))

@@ -15,7 +15,7 @@ import numpy as np
 from ..core.camera import Camera, opaque
 from .gbuffer import Maps
 from .project import NEAR, NEAR_SCALES
-from .tiles import BLOCK, LOW_PASS, Cutoffs
+from .tiles import BLOCK, Cutoffs
 
 if TYPE_CHECKING:
     from ..surfels.surfels import Surfels
@@ -36,7 +36,7 @@ def _about(lens, x, y, dx, dy):
     return x + (yy * dx - xy * dy) * inverse, y + (xx * dy - yx * dx) * inverse
 
 
-def _front_to_back(surfels, camera) -> np.ndarray:
+def _front_to_back(surfels, camera, cutoffs) -> np.ndarray:
     """[pixels, N] indices of the surfels in front of the camera, by the depth at which the ray through the middle of the
     pixel's block meets them."""
     (width, height), camera = camera.size, camera.baked()
@@ -56,7 +56,7 @@ def _front_to_back(surfels, camera) -> np.ndarray:
         t = (center * normal).sum(-1) / (ray * normal).sum(-1)  # [rows, columns, N]
         offset = t[..., None] * ray - center
         on_plane = ((offset * t_u).sum(-1) / scales[:, 0]) ** 2 + ((offset * t_v).sum(-1) / scales[:, 1]) ** 2
-    on_screen = LOW_PASS * ((middle - projected) ** 2).sum(-1)
+    on_screen = cutoffs.low_pass * ((middle - projected) ** 2).sum(-1)
     depth = np.where((t > 0) & (on_plane <= on_screen), t, center[:, 2])
     order = front[np.argsort(depth, axis=-1, kind="stable")]
     return order.repeat(BLOCK[1], 0).repeat(BLOCK[0], 1)[:height, :width].reshape(width * height, -1).astype(np.uint32)
@@ -77,6 +77,32 @@ def median_depth_reference(
     return np.where(left[:, -1] <= 0.5, np.take_along_axis(z, first, 1)[:, 0], 0), 1 - left[:, -1]
 
 
+def render_ellipses_reference(surfels: "Surfels", camera: Camera, dilation: float, cutoffs: Cutoffs) -> np.ndarray:
+    """Return colour and alpha of `ellipses.render_ellipses`, [H, W, 4]. The Jacobian is that of differences of what the camera
+    itself projects."""
+    fields = {name: value.astype(np.float64) for name, value in surfels.numpy().items()}
+    axes = np.stack([v.numpy().T.astype(np.float64) for v in surfels.frames()[:2]], -1) * fields["scales"][:, None]
+    center, depth = camera.project(fields["centers"])
+    to = lambda sign: np.stack([camera.project(fields["centers"] + sign * _STEP * e)[0] for e in np.eye(3)], -1)
+    axes = (to(1) - to(-1)) / (2 * _STEP) @ axes
+    inverse = np.linalg.inv(axes @ axes.swapaxes(1, 2) + dilation * np.eye(2))
+    view = fields["centers"] - camera.origin
+    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    colors = np.minimum(surfels.radiance(mi.Vector3f(np.float32(view.T))).numpy().T, 1)
+    x, y = (np.arange(n) + 0.5 for n in camera.size)
+    pixels = np.stack(np.meshgrid(x, y), -1)
+    image, T = np.zeros((*pixels.shape[:2], 4)), np.ones(pixels.shape[:2])
+    for k in np.argsort(depth, kind="stable"):
+        offset = pixels - center[k]
+        alpha = fields["opacities"][k] * np.exp(-0.5 * np.einsum("...i,ij,...j", offset, inverse[k], offset))
+        w = np.where(
+            (alpha > cutoffs.alpha_min) & (T > cutoffs.transmittance_min), T * np.minimum(alpha, cutoffs.alpha_max), 0
+        )
+        image += w[..., None] * np.append(colors[k], 1)
+        T = T - w
+    return image
+
+
 def _maps(surfels, camera, cutoffs):
     """(`Maps`; α and depth of every surfel in every pixel, front to back, [pixels, N] each)."""
     width, height = camera.size
@@ -84,7 +110,7 @@ def _maps(surfels, camera, cutoffs):
 
     centers = surfels.column(mi.Point3f, "centers")
     depth = (rotation @ (centers - origin)).z
-    order = _front_to_back(surfels, camera)
+    order = _front_to_back(surfels, camera, cutoffs)
     n = order.shape[1]
     surfel = mi.UInt32(order.ravel())  # pixel-major, front to back
     pixel = dr.arange(mi.UInt32, width * height * n) // n
@@ -102,7 +128,7 @@ def _maps(surfels, camera, cutoffs):
     t = facing / dr.dot(d, normal)
     u, v = dr.dot(t * d - center, t_u) / scales.x, dr.dot(t * d - center, t_v) / scales.y
     on_plane = dr.select(t > 0, u * u + v * v, dr.largest(mi.Float))
-    on_screen = LOW_PASS * dr.squared_norm(offset)
+    on_screen = cutoffs.low_pass * dr.squared_norm(offset)
     alpha = of(mi.Float, "opacities") * dr.exp(-0.5 * dr.minimum(on_plane, on_screen))
     alpha = dr.select(alpha > cutoffs.alpha_min, dr.minimum(alpha, cutoffs.alpha_max), 0)
     dr.eval(alpha)

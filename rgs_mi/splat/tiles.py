@@ -13,9 +13,6 @@ import mitsuba as mi
 BLOCKS = (4, 4)  # in a tile, each shaded by one SIMD lane
 BLOCK = (2, 2)  # pixels
 TILE = (BLOCKS[0] * BLOCK[0], BLOCKS[1] * BLOCK[1])
-#: Screen-space low-pass: a surfel weighs at least exp(−LOW_PASS |δ|²/2), δ in pixels. σ = ½ px, as renderers filter their
-#: pixels; 2DGS's σ² = ½ px² blurs creases.
-LOW_PASS = 4.0
 
 
 @dataclass(frozen=True)
@@ -25,6 +22,8 @@ class Cutoffs:
     alpha_min          alphas below are dropped
     alpha_max          alphas above are clamped
     transmittance_min  a pixel ends once its transmittance falls to it
+    low_pass           of the screen: a surfel weighs at least exp(−low_pass |δ|²/2), δ in pixels. σ = ½ px, as renderers filter
+                       their pixels; 2DGS's σ² = ½ px² blurs creases
     resort_window      how many surfels a block holds back to bring them into its own order (StopThePop, Radl et al. 2024).
                        Fewer leave seams between tiles: on a fitted helmet, two grids of tiles differ by 33 dB without any,
                        by 37, 40 and 46 dB with 4, 8 and 16
@@ -33,6 +32,7 @@ class Cutoffs:
     alpha_min: float = 1 / 255
     alpha_max: float = 0.99
     transmittance_min: float = 1e-4
+    low_pass: float = 4.0
     resort_window: int = 16
 
 

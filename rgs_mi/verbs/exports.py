@@ -23,9 +23,12 @@ def export(parser: Parser) -> Run:
         "--refine",
         type=float,
         metavar="MINUTES",
-        help="of mesh: so long Mitsuba's path tracer fits textures and light to the training photographs",
+        help="so long Mitsuba's path tracer fits a mesh's textures and light to the training photographs, or splats are fitted "
+        "to what the run looks like, also behind its mirrors",
     )
-    parser.add_argument("--data", type=Path, metavar="DIR", help="of mesh: the photographs (default: where they were)")
+    parser.add_argument(
+        "--data", type=Path, metavar="DIR", help="of mesh, and with --refine: the photographs (default: where they were)"
+    )
     add_common(parser)
 
     def run(args):

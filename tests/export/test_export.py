@@ -10,15 +10,20 @@ import numpy as np
 import pytest
 
 import rgs_mi
+from rgs_mi.commands import export_splats
 from rgs_mi.commands.export import FORMATS, export
 from rgs_mi.core.errors import UserError
+from rgs_mi.evaluation.metrics import psnr
 from rgs_mi.export.bake import bake
+from rgs_mi.export.render import sensor_dict, straight
+from rgs_mi.splat.ellipses import render_ellipses
 from rgs_mi.surfels.ply import read_ply, write_ply
+from rgs_mi.surfels.surfels import Surfels
 
 from judges import package, splat_transform, validated_gltf
 from readers import glb_splats, harmonics
 from runs import start_script
-from scenes import sphere_surfels
+from scenes import orbit_camera, sphere_surfels, tangent_surfels
 from variants import VARIANT
 
 SCENE = """<scene version="3.0.0">
@@ -62,6 +67,44 @@ def test_usd_has_the_environment_beside_it(run, tmp_path):
     assert sorted(path.name for path in (tmp_path / "a").iterdir()) == ["environment.exr", "splats.usdc"]
     own, written = (np.array(mi.Bitmap(str(path))) for path in (run / "environment.exr", paths[1]))
     assert np.allclose(own, written, atol=1e-3)
+
+
+def test_refined_splats_look_as_the_run_does(run, tmp_path, monkeypatch):
+    """A mirror more than baked ones do, in a viewer, from where it has not been looked at."""
+    monkeypatch.setattr(export_splats, "_VIEWS", 40)
+    monkeypatch.setattr(export_splats, "_WITHIN", 500)
+    shutil.copytree(run, tmp_path / "mirror")
+    mirror = tangent_surfels(2000, curvature=(1, 0, 1)).numpy()
+    mirror |= {"roughness": np.full((2000, 1), 0.1), "metallic": np.ones((2000, 1)), "sh": np.full((2000, 3), -3.0)}
+    write_ply(tmp_path / "mirror" / "object.ply", mirror)
+    path = tmp_path / "mirror" / "scene.xml"
+    scene = mi.load_file(str(path))
+    cameras = [orbit_camera(angle, (48, 48)) for angle in np.linspace(0, 6, 30)]
+    baked = bake(scene, path, quiet=True)
+    refined = export_splats.refine(baked, scene, path, cameras, 0.4, quiet=True)
+
+    def score(splats):
+        own = {name: getattr(splats, name) for name in ("centers", "rotations", "scales")}
+        own |= {"opacities": splats.opacities[:, None], "sh": splats.harmonics.reshape(len(splats), -1)}
+        surfels, scores = Surfels.from_numpy(sphere_surfels(len(splats)).numpy() | own), []
+        for camera in (orbit_camera(angle, (48, 48)) for angle in (0.1, 1.9, 4.3)):
+            sensor = mi.load_dict(sensor_dict(camera, scene))
+            true, picture = straight(np.array(mi.render(scene, sensor=sensor, spp=4))), render_ellipses(surfels, camera)
+            true = true[..., :3] * true[..., 3:] + 1 - true[..., 3:]
+            shown = np.array(picture.color).T + 1 - np.array(picture.alpha)[:, None]
+            scores.append(psnr(shown.clip(0, 1).reshape(true.shape), true))
+        return np.mean(scores)
+
+    assert score(refined) > 30 > 27 > score(baked)
+    assert len(refined) != len(baked) and refined.origin == baked.origin
+    assert np.abs(np.linalg.norm(refined.rotations, axis=1) - 1).max() < 1e-5
+
+
+def test_refining_goes_into_the_file(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(export_splats, "_VIEWS", 5)
+    (path,) = export(run, "gltf-splat", out=tmp_path, refine=0.02, quiet=True)
+    (centers, *_), _, _ = glb_splats(path)
+    assert len(centers) > 300 and "photographs are gone" in capsys.readouterr().err
 
 
 def test_script(run, tmp_path):

@@ -454,8 +454,8 @@ def test_refining_leaves_what_is_right(exported, monkeypatch):
 @pytest.mark.parametrize(
     "options, words",
     [
-        ({"to": "splat", "refine": 1.0}, "--refine: only the format 'mesh'"),
-        ({"to": "usd", "data": "there"}, "--data: only the format 'mesh'"),
+        ({"to": "usd", "data": "there"}, "--data: splats are made of a run alone, unless they are refined"),
+        ({"to": "splat", "refine": float("nan")}, "--refine nan: needs a number of minutes above 0"),
         ({"to": "mesh", "refine": 0.0}, "--refine 0: needs a number of minutes above 0"),
         ({"to": "mesh", "refine": 1.0}, "does not say where the photographs are: give their folder with --data"),
         ({"to": "mesh", "data": "nowhere"}, "data folder 'nowhere' does not exist"),

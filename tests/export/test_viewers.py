@@ -7,6 +7,7 @@ from rgs_mi.evaluation.metrics import psnr
 from rgs_mi.export import gltf_splat, splat_ply
 from rgs_mi.export.splats import Splats
 from rgs_mi.shading import deferred
+from rgs_mi.splat.ellipses import DILATIONS, render_ellipses
 from rgs_mi.surfels.surfels import Surfels
 
 from judges import babylon
@@ -41,3 +42,18 @@ def test_babylon_shows_what_we_do(write, turn, tmp_path):
             theirs = draw(camera, turn)
             # measured: 36.8; mirrored 19.3, with harmonics of a mirrored world 17.8
             assert psnr(theirs, ours) > 27 > 22 > psnr(theirs[:, ::-1], ours)
+
+
+def test_babylon_draws_our_ellipses(tmp_path):
+    splats, surfels = painted_ball()
+    (path,) = splat_ply.write(tmp_path, splats)
+    with babylon(path) as draw:
+        for angle in (0.3, 2.5):
+            camera = orbit_camera(angle, SIZE)
+            theirs = draw(camera)
+            scores = []
+            for dilation in DILATIONS:
+                picture = render_ellipses(surfels, camera, dilation)
+                ours = np.array(picture.color).T + 1 - np.array(picture.alpha)[:, None]
+                scores.append(psnr(theirs, ours.clip(0, 1).reshape(*SIZE[::-1], 3)))
+            assert scores[1] > 45 > scores[0]

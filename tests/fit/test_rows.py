@@ -92,6 +92,14 @@ def test_rows_are_read_where_they_are_by_now():
         np.testing.assert_array_equal(np.array(read[name]).T, both.rows.numpy(name)[index])
 
 
+def test_clipping():
+    rows, given = Rows(fields()), fields()
+    rows.clip({"three": 0.5, "many": 1.0})
+    assert np.array_equal(rows.numpy("one"), given["one"]) and abs(given["one"]).max() > 1
+    for name, most in (("three", 0.5), ("many", 1.0)):
+        assert np.array_equal(rows.numpy(name), given[name].clip(-most, most)) and abs(given[name]).max() > most
+
+
 def test_a_step_that_sees_nothing_counts():
     both, rng = Both(5000), np.random.default_rng(4)
     both.step(np.arange(N), rng)
