@@ -1,5 +1,6 @@
 """Splats that are fitted to pictures as viewers will show them: display colours, nothing to be lit (`splat.ellipses`)."""
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -75,12 +76,14 @@ class SplatFit(Fit):
     def _view(self, i, lighting, weight, statistics):
         assert self.photographs is not None
         photo = self.photographs.tile(i, self.views_used // len(self.dataset.train) + i)
-        index = self.model.in_view(photo.camera, _CUTOFFS, project_ellipses)
+        whole = self.dataset.train[i].camera.resized(*photo.size)
+        projected = functools.partial(project_ellipses, whole=whole)
+        index = self.model.in_view(photo.camera, _CUTOFFS, projected)
         surfels = self.model.take(index, self.sh_order, once=True)
         offset, contribution = (dr.zeros(mi.Vector2f, len(surfels)) for _ in range(2))
         dr.enable_grad(offset, contribution)
         dilation = DILATIONS[self.step_number % len(DILATIONS)]  # what is right in all viewers is so at other sizes, too
-        picture = render_ellipses(surfels, photo.camera, dilation, offset, _CUTOFFS, contribution)
+        picture = render_ellipses(surfels, photo.camera, dilation, offset, _CUTOFFS, contribution, whole)
         color, alpha = losses.completed(picture.color, picture.alpha, _CUTOFFS.transmittance_min)
         shown = losses.evaluated_adjoint(color + (1 - alpha) * photo.behind)
         w, size = self.settings.weights, photo.camera.size

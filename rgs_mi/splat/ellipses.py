@@ -8,6 +8,9 @@ with the rotation W from world to camera, the Jacobian J of the projection at th
 pixels (EWA splatting, Zwicker et al. 2002). Σ is that of a surfel, s_u² t_u t_uᵀ + s_v² t_v t_vᵀ. With A Aᵀ + B Bᵀ = Σ'⁻¹ and
 N = 0 an ellipse is a projected Gaussian of (1) in `project.py`, whose depth is everywhere its center's. So the lists and the
 walk of (2) serve for both: in them ellipses are sorted by their centers' depths, as in viewers.
+
+Far beside the picture J makes giants of small splats, so viewers leave out those whose centers lie beyond its borders: Babylon.js
+from `BEYOND` times half of its width or height from its middle on, 3DGS's own clamps J at 1.3 times.
 """
 
 from dataclasses import dataclass
@@ -28,6 +31,7 @@ if TYPE_CHECKING:
 
 #: d of 3DGS, PlayCanvas and others, and of Babylon.js, which counts half pixels.
 DILATIONS = 0.3, 0.3 / 4
+BEYOND = 1.2
 #: Nothing is left for the low-pass to do, nor for blocks to sort.
 CUTOFFS = Cutoffs(low_pass=2 / min(DILATIONS), resort_window=0)
 
@@ -53,9 +57,11 @@ def project_ellipses(
     camera: Camera,
     dilation: float = DILATIONS[0],
     means2d_offset: "mi.Vector2f | None" = None,
+    whole: Camera | None = None,
 ) -> Projected:
     """Project all N ``surfels`` into ``camera``, a pinhole, by (26) with the ``dilation`` d; differentiable. Normals have no
-    derivatives; ``means2d_offset`` is that of `project`."""
+    derivatives; ``means2d_offset`` is that of `project`. ``whole`` is the camera of the picture of which ``camera`` sees a part
+    (None: all)."""
     R, origin, f, principal, _ = opaque(camera, len(surfels))
     offset = surfels.column(mi.Vector3f, "centers") - origin
     p, scales = R @ offset, surfels.column(mi.Vector2f, "scales")
@@ -63,6 +69,9 @@ def project_ellipses(
     visible = p.z > dr.minimum(NEAR, NEAR_SCALES * dr.maximum(scales.x, scales.y))
     z = dr.select(visible, p.z, 1)
     x, y = p.x / z, p.y / z
+    picture = whole or camera
+    for value, focal, middle, size in zip((x, y), f, opaque(picture).principal, picture.size):
+        visible &= dr.abs(value * focal + middle - size / 2) < BEYOND * size / 2
     d, on_screen = (
         dr.opaque(mi.Float, dilation),
         lambda v: mi.Vector2f(f.x * (v.x - x * v.z) / z, f.y * (v.y - y * v.z) / z),
@@ -87,10 +96,12 @@ def render_ellipses(
     means2d_offset: "mi.Vector2f | None" = None,
     cutoffs: Cutoffs = CUTOFFS,
     contribution: "mi.Vector2f | None" = None,
+    whole: Camera | None = None,
 ) -> Picture:
     """Draw ``surfels``, whose radiance is taken for display values and clipped to [0, 1], as a viewer does that knows nothing
-    else of them; differentiable. ``dilation`` is d of (26), the other arguments are those of `render_gbuffer`."""
-    projected = project_ellipses(surfels, camera, dilation, means2d_offset)
+    else of them; differentiable. ``dilation`` and ``whole`` are those of `project_ellipses`, the other arguments those of
+    `render_gbuffer`."""
+    projected = project_ellipses(surfels, camera, dilation, means2d_offset, whole)
     features = [*dr.minimum(surfels.radiance(projected.view), 1), *(() if contribution is None else contribution)]
     dr.eval(projected.geometry, features)
     isects = isect_tiles(projected, camera.size, cutoffs)

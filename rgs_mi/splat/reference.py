@@ -13,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..core.camera import Camera, opaque
+from .ellipses import BEYOND
 from .gbuffer import Maps
 from .project import NEAR, NEAR_SCALES
 from .tiles import BLOCK, Cutoffs
@@ -77,7 +78,9 @@ def median_depth_reference(
     return np.where(left[:, -1] <= 0.5, np.take_along_axis(z, first, 1)[:, 0], 0), 1 - left[:, -1]
 
 
-def render_ellipses_reference(surfels: "Surfels", camera: Camera, dilation: float, cutoffs: Cutoffs) -> np.ndarray:
+def render_ellipses_reference(
+    surfels: "Surfels", camera: Camera, dilation: float, cutoffs: Cutoffs, whole: Camera
+) -> np.ndarray:
     """Return colour and alpha of `ellipses.render_ellipses`, [H, W, 4]. The Jacobian is that of differences of what the camera
     itself projects."""
     fields = {name: value.astype(np.float64) for name, value in surfels.numpy().items()}
@@ -92,7 +95,10 @@ def render_ellipses_reference(surfels: "Surfels", camera: Camera, dilation: floa
     x, y = (np.arange(n) + 0.5 for n in camera.size)
     pixels = np.stack(np.meshgrid(x, y), -1)
     image, T = np.zeros((*pixels.shape[:2], 4)), np.ones(pixels.shape[:2])
+    beside = np.abs(whole.project(fields["centers"])[0] / whole.size - 0.5).max(1) > 0.5 * BEYOND
     for k in np.argsort(depth, kind="stable"):
+        if beside[k] or depth[k] < NEAR:
+            continue
         offset = pixels - center[k]
         alpha = fields["opacities"][k] * np.exp(-0.5 * np.einsum("...i,ij,...j", offset, inverse[k], offset))
         w = np.where(

@@ -17,9 +17,9 @@ FIELDS = "centers", "rotations", "scales", "opacities", "sh"
 SMOOTH = replace(CUTOFFS, alpha_min=1e-7, alpha_max=0.9999, transmittance_min=0)
 
 
-def rendered(surfels, camera, dilation, cutoffs=CUTOFFS):
+def rendered(surfels, camera, dilation, whole=None):
     """Colour and alpha, [H, W, 4]."""
-    picture = render_ellipses(surfels, camera, dilation, cutoffs=cutoffs)
+    picture = render_ellipses(surfels, camera, dilation, whole=whole)
     return np.stack([*picture.color.numpy(), picture.alpha.numpy()], -1).reshape(*camera.size[::-1], 4)
 
 
@@ -38,7 +38,7 @@ def rendered(surfels, camera, dilation, cutoffs=CUTOFFS):
 @pytest.mark.parametrize("scale", [0.6, 0.03], ids=["wide", "less than a pixel"])
 def test_forward_equals_reference(camera, dilation, scale):
     surfels = sphere_surfels(150, seed=3, scale=scale, order=3)
-    mine, twin = rendered(surfels, camera, dilation), render_ellipses_reference(surfels, camera, dilation, CUTOFFS)
+    mine, twin = rendered(surfels, camera, dilation), render_ellipses_reference(surfels, camera, dilation, CUTOFFS, camera)
     # A weight within rounding of the cut-off may fall on either side of it: those few pixels differ by at most 1/255.
     difference = np.abs(mine - twin)
     assert difference.max() < 5e-3 and (difference > 1e-4).mean() < 2e-3 and twin[..., 3].max() > 0.05
@@ -61,7 +61,7 @@ def test_gradients_equal_differences_of_the_reference(name, seed):
 
     def value(step):
         moved = Surfels.from_numpy({**base, name: base[name] + step * direction})
-        return float((render_ellipses_reference(moved, camera, dilation, SMOOTH) * weights).sum())
+        return float((render_ellipses_reference(moved, camera, dilation, SMOOTH, camera) * weights).sum())
 
     central = lambda h: (value(h) - value(-h)) / (2 * h)
     expected = (4 * central(2e-3) - central(4e-3)) / 3  # Richardson: the h² term of the central difference cancels
@@ -81,6 +81,18 @@ def test_contributions_are_what_surfels_weigh():
         expected = dr.grad(surfels.sh).numpy()[:, 1] * 2 * np.sqrt(np.pi)
         assert expected.max() > 1
         np.testing.assert_allclose(mine.numpy(), expected, atol=1e-3 * expected.max())
+
+
+def test_a_part_of_a_picture_shows_what_the_whole_does():
+    """From among the surfels, where viewers leave out what lies far beside a picture, and not what lies beside a part of it."""
+    whole = orbit_camera(size=(64, 48), distance=0.6)
+    surfels = sphere_surfels(200, seed=1, scale=0.5)
+    picture = rendered(surfels, whole, DILATIONS[0])
+    part = whole.cropped(40, 8, 24, 32)
+    shown = rendered(surfels, part, DILATIONS[0], whole)
+    twin = render_ellipses_reference(surfels, part, DILATIONS[0], CUTOFFS, whole)
+    assert np.abs(shown - twin).max() < 5e-3 and np.abs(shown - picture[8:40, 40:]).max() < 5e-3
+    assert np.abs(rendered(surfels, part, DILATIONS[0]) - shown).max() > 0.05
 
 
 def test_what_lies_behind_or_beside_is_not_drawn():
