@@ -71,6 +71,8 @@ def export(
     splats = replace(bake(scene, path, quiet), origin=origin)
     if refine:
         seen = [p.camera for p in training_photographs(run, data)] or [Camera.from_sensor(s) for s in scene.sensors()]
+        if not seen:
+            raise UserError(f"{path}: has no sensors, and its photographs are gone: nothing says where to look from")
         splats = export_splats.refine(splats, scene, path, seen, refine, quiet)
     if to == "splat":
         return splat_ply.write(folder, splats)

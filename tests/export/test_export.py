@@ -107,6 +107,15 @@ def test_refining_goes_into_the_file(run, tmp_path, monkeypatch, capsys):
     assert len(centers) > 300 and "photographs are gone" in capsys.readouterr().err
 
 
+def test_refining_needs_places_to_look_from(run, tmp_path):
+    shutil.copytree(run, tmp_path / "blind")
+    path = tmp_path / "blind" / "scene.xml"
+    head, _, rest = path.read_text().partition("<sensor")
+    path.write_text(head + rest.partition("</sensor>")[2])
+    with pytest.raises(UserError, match="has no sensors, and its photographs are gone"):
+        export(tmp_path / "blind", "splat", refine=1.0, quiet=True)
+
+
 def test_script(run, tmp_path):
     process = start_script("export.py", run, "--to", "splat", "--out", tmp_path / "b")
     out, err = process.communicate()
