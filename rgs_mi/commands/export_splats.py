@@ -23,11 +23,7 @@ from ..surfels.surfels import rotation_from_normal
 _VIEWS, _NEIGHBORS, _PLACES = 300, 5, 9  # pictures; cameras that one has beside it; places from it to one of these
 _LONGEST, _SPP = 800, 4  # pixels along a picture's longer side, at most; samples a pixel
 _SPLATS = 90_000  # at most, or as many as there are surfels
-_WITHIN, _FAINT, _SCALE = (
-    15_000,
-    0.1,
-    0.8,
-)  # splats that begin anywhere in the object, their opacity, their size over distances
+_WITHIN, _FAINT, _SCALE = 15_000, 0.1, 0.8  # splats that begin anywhere in the object, their opacity, their size over gaps
 _CLEARER = 0.5  # opacity of what hides these, over what it was
 _SMOOTHING = 0.95  # of the PSNR that the progress line shows
 

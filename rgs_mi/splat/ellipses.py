@@ -29,7 +29,7 @@ from .tiles import Cutoffs
 if TYPE_CHECKING:
     from ..surfels.surfels import SurfelColumns
 
-#: d of 3DGS, PlayCanvas and others, and of Babylon.js, which counts half pixels.
+#: d of 3DGS, PlayCanvas and others, and of Babylon.js, which adds as much to splats of twice the size.
 DILATIONS = 0.3, 0.3 / 4
 BEYOND = 1.2
 #: Nothing is left for the low-pass to do, nor for blocks to sort.
@@ -72,11 +72,8 @@ def project_ellipses(
     picture = whole or camera
     for value, focal, middle, size in zip((x, y), f, opaque(picture).principal, picture.size):
         visible &= dr.abs(value * focal + middle - size / 2) < BEYOND * size / 2
-    d, on_screen = (
-        dr.opaque(mi.Float, dilation),
-        lambda v: mi.Vector2f(f.x * (v.x - x * v.z) / z, f.y * (v.y - y * v.z) / z),
-    )  # J
-    u, v = on_screen(R @ t_u * scales.x), on_screen(R @ t_v * scales.y)
+    J = lambda v: mi.Vector2f(f.x * (v.x - x * v.z) / z, f.y * (v.y - y * v.z) / z)
+    u, v, d = J(R @ t_u * scales.x), J(R @ t_v * scales.y), dr.opaque(mi.Float, dilation)
     xx, xy, yy = u.x * u.x + v.x * v.x + d, u.x * u.y + v.x * v.y, u.y * u.y + v.y * v.y + d
     B_y = dr.rsqrt(yy)
     A_x = dr.rsqrt(xx - xy * xy / yy)
