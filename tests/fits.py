@@ -6,12 +6,12 @@ import numpy as np
 
 from rgs_mi.datasets.types import Dataset, View
 from rgs_mi.fit import losses
-from rgs_mi.fit.model import Model
+from rgs_mi.fit.model import SURFEL_PARAMETERS, Model
 from rgs_mi.settings.settings import Density, Initialization, Settings, Stage
 from rgs_mi.shading import deferred
 from rgs_mi.shading.lighting import Lighting
 from rgs_mi.shading.split_sum import SplitSum
-from rgs_mi.surfels.surfels import Surfels
+from rgs_mi.surfels.surfels import Surfels, sh_order
 
 from scenes import orbit_camera, sphere_surfels
 
@@ -31,6 +31,32 @@ def model(seed=0):
     return Model.start(
         x, x, np.full((300, 3), 0.3), np.full(300, 0.15), np.full((16, 32, 3), 0.5), np.eye(3), 1, specular=0.5
     )
+
+
+def model_of(surfels: Surfels) -> Model:
+    """The model that has these ``surfels``."""
+    s, order = surfels.numpy(), sh_order(surfels.channels("sh"))
+    n, logit = len(surfels), lambda p: np.log(p / (1 - p))
+    learned = Model.start(
+        s["centers"], s["centers"], np.full((n, 3), 0.5), np.full(n, 0.1), np.full((8, 16, 3), 0.5), np.eye(3), order
+    )
+    given = {
+        "rotations": s["rotations"],
+        "log_scales": np.log(s["scales"]),
+        "logit_opacities": logit(s["opacities"]),
+        "sh_dc": s["sh"][:, :3],
+        "sh_rest": s["sh"][:, 3:],
+        "logit_base_color": logit(s["base_color"]),
+        "logit_roughness": logit(s["roughness"]),
+        "logit_metallic": logit(s["metallic"]),
+        "delta_normal": s["delta_normal"],
+        "curvature": s["curvature"],
+    }
+    assert {*given, "centers"} == set(SURFEL_PARAMETERS)
+    for name, value in given.items():
+        learned.set(name, value)
+    learned.two_sided = surfels.two_sided
+    return learned
 
 
 def photographed() -> tuple[Surfels, Lighting]:

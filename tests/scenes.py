@@ -1,5 +1,7 @@
 """Small scenes that several tests share."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from rgs_mi.core.camera import Camera
@@ -52,6 +54,15 @@ def tangent_surfels(n, curvature=(0, 0, 0)):
 def orbit_camera(angle=0.3, size=(48, 40), distance=4.0, fov=38.0):
     """A camera on a circle about the z axis that looks at the origin."""
     return Camera.look_at([distance * np.cos(angle), distance * np.sin(angle), 0.8], [0, 0, 0], [0, 0, 1], fov, size)
+
+
+VARIED_CAMERAS = {
+    "plain": orbit_camera(),
+    "odd size": orbit_camera(2.0, (37, 53)),
+    "inside reach": orbit_camera(1.0, (64, 64), distance=1.6),
+    "principal point": replace(orbit_camera(0.7), principal=(11.0, 31.0)),
+    "anisotropic pixels": replace(orbit_camera(0.2), focal=(90.0, 50.0)),
+}
 
 
 def layered_surfels(camera, seed):

@@ -14,18 +14,18 @@ from ..core.interrupt import GracefulInterrupt
 from ..core.progress import Progress
 from ..datasets.types import View
 from ..export.render import sensor_dict, smooth_path, straight
-from ..export.splats import Splats
-from ..fit.model import logit
+from ..export.splats import DEGREE, Splats
+from ..fit.model import Model, logit
 from ..fit.splats import SplatFit
-from ..plugins import lit_surfels
-from ..surfels.surfels import rotation_from_normal
+from ..plugins import deferred_of
+from ..priors.initialization import spacing_of
+from .fit_line import FitLine
 
 _VIEWS, _NEIGHBORS, _PLACES = 300, 5, 9  # pictures; cameras that one has beside it; places from it to one of these
 _LONGEST, _SPP = 800, 4  # pixels along a picture's longer side, at most; samples a pixel
 _SPLATS = 90_000  # at most, or as many as there are surfels
 _WITHIN, _FAINT, _SCALE = 15_000, 0.1, 0.8  # splats that begin anywhere in the object, their opacity, their size over gaps
 _CLEARER = 0.5  # opacity of what hides these, over what it was
-_SMOOTHING = 0.95  # of the PSNR that the progress line shows
 
 
 def refine(
@@ -33,19 +33,15 @@ def refine(
 ) -> Splats:
     """Return ``splats``, which were baked of the ``scene`` in the file ``path``, after a fit of so many ``minutes`` to pictures
     of it that are taken between ``cameras``, or until someone interrupts it."""
-    _, lighting = lit_surfels(scene, path)
-    box = None if lighting is None else lighting.box
+    box = deferred_of(scene, path).box
     extent = float(np.linalg.norm(splats.centers - splats.centers.mean(0), axis=1).max()) if box is None else box.radius
     views = pictures(scene, cameras, quiet)
-    fit, psnr = SplatFit(views, _begun(splats), minutes, max(_SPLATS, len(splats)), extent, box), None
+    fit = SplatFit(views, _begun(splats), minutes, max(_SPLATS, len(splats)), extent, box)
     with Progress(60 * minutes, quiet, "refining") as progress, GracefulInterrupt() as interrupt:
+        line = FitLine(fit, progress)
         while fit.progress < 1 and interrupt.signal is None:
-            before = fit.elapsed
             fit.step()
-            psnr = fit.psnr if psnr is None else _SMOOTHING * psnr + (1 - _SMOOTHING) * fit.psnr
-            progress.update(
-                fit.progress, psnr=psnr, splats=len(fit.model), ms=1e3 * (fit.elapsed - before), pixels=fit.pixels
-            )
+            line.update()
     found = fit.splats().numpy()
     return replace(
         splats,
@@ -88,28 +84,21 @@ def _between(cameras):
 
 
 def _begun(splats):
-    """What the fit begins with: ``splats``, not as opaque as they are, and faint ones all over the object, where what bulges has
-    the images of what it mirrors."""
-    rng, coefficients = np.random.default_rng(0), splats.harmonics.shape[1]
+    """The model that the fit begins with: ``splats``, not as opaque as they are, and faint ones all over the object, where what
+    bulges has the images of what it mirrors."""
     low, high = np.percentile(splats.centers, (0.5, 99.5), axis=0)
-    centers = rng.uniform(low, high, (_WITHIN, 3))
-    normals = rng.normal(size=centers.shape)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    spacing = KDTree(centers).query(centers, 4)[0][:, 1:].mean(1, keepdims=True)
-    faint = {
-        "centers": centers,
-        "rotations": rotation_from_normal(normals, rng.uniform(0, 2 * np.pi, _WITHIN)),
-        "log_scales": np.log(_SCALE * spacing.repeat(2, 1)),
-        "logit_opacities": np.full((_WITHIN, 1), logit(_FAINT)),
-        "sh_dc": np.zeros((_WITHIN, 3)),
-        "sh_rest": np.zeros((_WITHIN, 3 * coefficients - 3)),
-    }
+    within = np.random.default_rng(0).uniform(low, high, (_WITHIN, 3))
+    centers, n = np.concatenate([splats.centers, within]), len(splats)
+    spacing = np.concatenate([np.ones(n), spacing_of(within)])
+    grey, no_light = np.full((len(centers), 3), 0.5), np.zeros((2, 4, 3))
+    model = Model.start(centers, None, grey, spacing, no_light, np.eye(3), DEGREE, scale=_SCALE, opacity=_FAINT)
     own = {
-        "centers": splats.centers,
         "rotations": splats.rotations,
         "log_scales": np.log(splats.scales),
         "logit_opacities": logit(_CLEARER * splats.opacities)[:, None],
         "sh_dc": splats.harmonics[:, 0],
-        "sh_rest": splats.harmonics[:, 1:].reshape(len(splats), -1),
+        "sh_rest": splats.harmonics[:, 1:].reshape(n, -1),
     }
-    return {name: np.concatenate([own[name], faint[name]]) for name in own}
+    for name, value in own.items():
+        model.set(name, np.concatenate([value, model.numpy(name)[n:]]))
+    return model

@@ -38,9 +38,9 @@ from ..settings.settings import Settings
 from ..shading.tables import specular_of
 from ..viewer import server
 from ..viewer.live import Watch
+from .fit_line import FitLine
 
 _ON_SURFACE, _ANYWHERE = 0.7, 0.1  # opacities to start with; where surfels fill space, more would hide what is within
-_SMOOTHING = 0.95  # of the PSNR that the progress line shows
 
 
 def optimize(
@@ -319,7 +319,7 @@ def _flat(tree, prefix="") -> dict:
 def _loop(fit, folder, quiet, events=None, watch=None) -> int | None:
     """Step until the budget is spent or someone stops it, also in a window (``watch``); returns None, or by which signal. Begins
     and ends with a checkpoint: a folder that can't be written is known before the work, not after it."""
-    settings, psnr, ranks = fit.settings, None, fit.ranks
+    settings, ranks = fit.settings, fit.ranks
     state = _state(fit, folder)
     checkpoint.save(folder, *state)
     ranks.same((settings, *state))  # for `join`
@@ -329,15 +329,12 @@ def _loop(fit, folder, quiet, events=None, watch=None) -> int | None:
     planned = None if settings.iterations else max(0.0, 60 * settings.minutes - fit.elapsed)
     # torchrun passes Ctrl-C on, to processes that the terminal has told already
     with GracefulInterrupt(patient=ranks.size > 1) as interrupt, Progress(planned, quiet) as progress:
+        line = FitLine(fit, progress)
         while ranks.same(fit.progress < 1 and interrupt.signal is None):
-            before = fit.elapsed
             recorded = fit.step()
             if not np.isfinite(fit.psnr):
                 raise _diverged(fit, folder)
-            psnr = fit.psnr if psnr is None else _SMOOTHING * psnr + (1 - _SMOOTHING) * fit.psnr
-            progress.update(
-                fit.progress, psnr=psnr, surfels=len(fit.model), ms=1e3 * (fit.elapsed - before), pixels=fit.pixels
-            )
+            line.update()
             if events and recorded:
                 events.add(fit.curves.rows[-1])
             if time.monotonic() - saved > settings.checkpoint_seconds:

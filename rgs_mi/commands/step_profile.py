@@ -44,7 +44,7 @@ STAGES = {
         (losses._Shifted, "backward"),
         (surfels._Split, "backward"),
     ),
-    "shading, back": ((gbuffer._Planes, "backward"), (composite, "_gather_image")),
+    "shading, back": ((composite.Planes, "backward"), (composite, "_gather_image")),
     "backward": ((composite.Composite, "backward"),),
     "projection, back": ((Statistics, "add"), (rows._Columns, "backward"), (Model, "gradients")),
     "density control": ((DensityControl, "note_reflective"), (DensityControl, "refine")),

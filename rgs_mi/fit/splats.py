@@ -1,12 +1,11 @@
 """Splats that are fitted to pictures as viewers will show them: display colours, nothing to be lit (`splat.ellipses`)."""
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..core.bounding_box import BoundingBox
 from ..datasets.types import Dataset, View
@@ -15,44 +14,38 @@ from ..shading.lighting import Shading
 from ..splat.ellipses import CUTOFFS, DILATIONS, project_ellipses, render_ellipses
 from ..surfels.surfels import SH_0, Surfels
 from . import losses
-from .model import ENVIRONMENT, SURFEL_PARAMETERS, Model
+from .model import Model
 from .plan import planned
 from .trainer import Fit
 
 _CUTOFFS = replace(CUTOFFS, transmittance_min=1e-2)  # of a step
-_UNLIT = {"logit_base_color": 3, "logit_roughness": 1, "logit_metallic": 1, "delta_normal": 3, "curvature": 3}
-_NO_LIGHT = np.zeros((2, 4, 3))
 #: Viewers hold the mean colour from 0 to 1, and all other coefficients from −1 to 1, in eight bits.
 _MOST, _OFTEN = {"sh_dc": 0.5 / SH_0, "sh_rest": 1.0}, 10  # steps from one time that they are clipped to the next
 
 
 class SplatFit(Fit):
-    """A fit of splats to pictures ``views``, which begins with ``parameters``, those of `SURFEL_PARAMETERS` that say where splats
-    are and what they show, and has ``minutes`` for up to ``most`` of them. Of ``extent`` and ``box`` see `Objective`."""
+    """A fit of the surfels of ``model``, whose radiance are display values, to pictures ``views``, which has ``minutes`` for
+    up to ``most`` of them. Of ``extent`` and ``box`` see `Objective`."""
 
     def __init__(
         self,
         views: Sequence[View],
-        parameters: Mapping[str, np.ndarray],
+        model: Model,
         minutes: float,
         most: int,
         extent: float,
         box: BoundingBox | None = None,
     ) -> None:
-        n = len(parameters["centers"])
         settings = Settings(
             minutes=minutes,
             specular_start=1,
             sh_order=3,
             sh_start=0,
-            initialization=Initialization(surfels=n),
+            initialization=Initialization(surfels=len(model)),
             density=Density(max_surfels=most, grow_by="loss"),
             learning_rates=LearningRates(rotations=(5e-3, 5e-4), sh_rest=(3e-2, 2e-3), environment=(0, 0)),
         )
         dataset = Dataset(list(views), [])
-        unlit = {name: np.zeros((n, channels)) for name, channels in _UNLIT.items()}
-        given = {name: (unlit | dict(parameters))[name] for name in SURFEL_PARAMETERS}
-        model = Model(given | {ENVIRONMENT: _NO_LIGHT}, np.eye(3))
         super().__init__(dataset, model, planned(settings, dataset), extent, Shading(box=box))
 
     def step(self) -> bool:

@@ -69,13 +69,13 @@ def initial_points(
         positions, normals = oriented_points(maps, count, rng)
         if len(positions) > _FEW * count:
             look = appearance(positions, compared, _seen_in(maps, compared))
-            return Points(positions, normals, _spacing(positions), look)
+            return Points(positions, normals, spacing_of(positions), look)
     if dataset.points is not None and len(dataset.points):
         chosen = np.sort(rng.permutation(len(dataset.points))[:count])
         positions = np.asarray(dataset.points, np.float32)[chosen]
         if dataset.point_colors is not None:
             colors = np.asarray(dataset.point_colors, np.float32)[chosen]
-            return Points(positions, None, _spacing(positions), Appearance.of(colors))
+            return Points(positions, None, spacing_of(positions), Appearance.of(colors))
     else:
         center, reach = focus_point([view.camera for view in views])
         # Half a frame's extent at the center, for the typical camera: inside that ball all of them see something.
@@ -83,7 +83,7 @@ def initial_points(
         ball = rng.normal(size=(count, 3))
         ball *= rng.random((count, 1)) ** (1 / 3) / np.linalg.norm(ball, axis=1, keepdims=True)
         positions = (center + reach * min(half, 1.0) * ball).astype(np.float32)
-    return Points(positions, None, _spacing(positions), _unhidden(positions, views))
+    return Points(positions, None, spacing_of(positions), _unhidden(positions, views))
 
 
 def _on_hull(views, count, rng, compare, outvoted, quiet) -> Points:
@@ -100,7 +100,7 @@ def _on_hull(views, count, rng, compare, outvoted, quiet) -> Points:
         )
         if not gone.all():
             positions, normals = (np.concatenate([on[~gone], new]) for on, new in zip((positions, normals), below))
-    spacing = _spacing(positions)
+    spacing = spacing_of(positions)
     depths = hull.depth_maps(*mesh[:2], [view.camera for view in views])
     reach = 2 * float(np.median(spacing))
     seen = lambda index, z, column, row: z < depths[index][row, column] + reach  # NaN: nothing is there
@@ -135,11 +135,11 @@ def surroundings(dataset: Dataset, count: int, seed: int = 0) -> Points:
     outward = np.random.default_rng((seed, 1)).normal(size=(count, 3))
     outward /= np.linalg.norm(outward, axis=1, keepdims=True)
     positions = (center + _FAR * reach * outward).astype(np.float32)
-    return Points(positions, -outward.astype(np.float32), _spacing(positions), _unhidden(positions, dataset.train))
+    return Points(positions, -outward.astype(np.float32), spacing_of(positions), _unhidden(positions, dataset.train))
 
 
-def _spacing(positions: np.ndarray) -> np.ndarray:
-    """[N] mean distance to the three nearest neighbours, 1e-7 at least; 1 for a lone point."""
+def spacing_of(positions: np.ndarray) -> np.ndarray:
+    """Return the mean distance [N] of ``positions`` [N, 3] to the three nearest neighbours, 1e-7 at least; 1 for a lone point."""
     neighbours = min(3, len(positions) - 1)
     if neighbours < 1:
         return np.ones(len(positions), np.float32)

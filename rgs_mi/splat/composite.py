@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .hit import PACKET, Hit, adding, fetch, pack, padded
+from .hit import PACKET, FetchAll, Hit, adding, fetch, pack, padded
 from .intersect import TileIntersections
 from .project import GEOMETRY, Projected
 from .tiles import Cutoffs, block_pixels
@@ -231,6 +231,18 @@ def composite(projected: Projected, features: "list[mi.Float]", isects: TileInte
     Differentiable in the projected Gaussians, in both modes."""
     derivatives = [value for derivative in projected.normal_derivatives for value in derivative] if layout.normals else []
     return dr.custom(Composite, projected.geometry + features + derivatives, isects, layout)
+
+
+class Planes(FetchAll):
+    """The custom operation of `planes`."""
+
+    def name(self) -> str:
+        return "rgs_mi.splat.Planes"
+
+
+def planes(image: "mi.Float", stride: int) -> "list[mi.Float]":
+    """Return the ``stride`` floats of all pixels of an ``image`` that has so many a pixel; differentiable."""
+    return dr.custom(Planes, image, stride)
 
 
 def median_depth(projected: Projected, isects: TileIntersections, size: tuple[int, int]) -> "tuple[mi.Float, mi.Float]":

@@ -20,8 +20,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.camera import Camera, opaque
-from .composite import Layout, composite
-from .hit import fetch
+from .composite import Layout, composite, planes
 from .intersect import isect_tiles
 from .project import NEAR, NEAR_SCALES, Projected
 from .tiles import Cutoffs
@@ -104,6 +103,5 @@ def render_ellipses(
     isects = isect_tiles(projected, camera.size, cutoffs)
     layout = Layout(camera.size, len(features), cutoffs, normals=False)
     image = composite(projected, features, isects, layout)
-    maps = fetch(image, dr.arange(mi.UInt32, camera.size[0] * camera.size[1]), layout.pixel)
-    *values, _, alpha = maps[: layout.values]
+    *values, _, alpha = planes(image, layout.pixel)[: layout.values]
     return Picture(mi.Color3f(*values[:3]), alpha, None if contribution is None else mi.Vector2f(*values[3:]), isects.seen)

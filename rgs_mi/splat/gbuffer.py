@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 
 from ..core.camera import Camera
-from .composite import Layout, composite
-from .hit import PACKET, FetchAll, fetch
+from .composite import Layout, composite, planes
+from .hit import PACKET, fetch
 from .intersect import isect_tiles
 from .project import project
 from .tiles import Cutoffs
@@ -59,7 +59,7 @@ class GBuffer:
     @functools.cached_property
     def all(self) -> Maps:
         """The maps of every pixel."""
-        return self._maps(dr.custom(_Planes, self.image, self._stride))
+        return self._maps(planes(self.image, self._stride))
 
     def maps(self, index: "mi.UInt32") -> Maps:
         """Return the maps at the pixels ``index`` (row-major)."""
@@ -86,13 +86,6 @@ class GBuffer:
             m[13] if self.full else None,
             contribution,
         )
-
-
-class _Planes(FetchAll):
-    """The floats of all pixels, of an image with so many floats a pixel."""
-
-    def name(self):
-        return "rgs_mi.splat.Planes"
 
 
 def render_gbuffer(

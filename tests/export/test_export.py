@@ -15,7 +15,6 @@ from rgs_mi.commands.export import FORMATS, export
 from rgs_mi.core.errors import UserError
 from rgs_mi.evaluation.metrics import psnr
 from rgs_mi.export.bake import bake
-from rgs_mi.export.render import sensor_dict, straight
 from rgs_mi.splat.ellipses import render_ellipses
 from rgs_mi.surfels.ply import read_ply, write_ply
 from rgs_mi.surfels.surfels import Surfels
@@ -24,6 +23,7 @@ from judges import package, splat_transform, validated_gltf
 from readers import glb_splats, harmonics
 from runs import start_script
 from scenes import orbit_camera, sphere_surfels, tangent_surfels
+from splat_viewers import rendered
 from variants import VARIANT
 
 SCENE = """<scene version="3.0.0">
@@ -88,9 +88,7 @@ def test_refined_splats_look_as_the_run_does(run, tmp_path, monkeypatch):
         own |= {"opacities": splats.opacities[:, None], "sh": splats.harmonics.reshape(len(splats), -1)}
         surfels, scores = Surfels.from_numpy(sphere_surfels(len(splats)).numpy() | own), []
         for camera in (orbit_camera(angle, (48, 48)) for angle in (0.1, 1.9, 4.3)):
-            sensor = mi.load_dict(sensor_dict(camera, scene))
-            true, picture = straight(np.array(mi.render(scene, sensor=sensor, spp=4))), render_ellipses(surfels, camera)
-            true = true[..., :3] * true[..., 3:] + 1 - true[..., 3:]
+            true, picture = rendered(scene, camera), render_ellipses(surfels, camera)
             shown = np.array(picture.color).T + 1 - np.array(picture.alpha)[:, None]
             scores.append(psnr(shown.clip(0, 1).reshape(true.shape), true))
         return np.mean(scores)

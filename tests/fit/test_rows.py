@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rgs_mi.core.camera import Camera
-from rgs_mi.fit.model import SURFEL_PARAMETERS, Model
+from rgs_mi.fit.model import SURFEL_PARAMETERS
 from rgs_mi.fit.rows import EPSILON, Rows
 from rgs_mi.splat.gbuffer import render_gbuffer
 from rgs_mi.splat.intersect import isect_tiles
@@ -14,6 +14,7 @@ from rgs_mi.splat.project import project
 from rgs_mi.splat.tiles import Cutoffs
 from rgs_mi.surfels.surfels import CHANNELS
 
+from fits import model_of
 from scenes import orbit_camera, sphere_surfels
 
 N = 40
@@ -142,37 +143,11 @@ def test_gradients_of_several_views_come_together(every, steps):
 # ---- Of a model ----
 
 
-def model(surfels):
-    """That of these ``surfels``."""
-    s = surfels.numpy()
-    n, logit = len(surfels), lambda p: np.log(p / (1 - p))
-    learned = Model.start(
-        s["centers"], s["centers"], np.full((n, 3), 0.5), np.full(n, 0.1), np.full((8, 16, 3), 0.5), np.eye(3), 1
-    )
-    given = {
-        "rotations": s["rotations"],
-        "log_scales": np.log(s["scales"]),
-        "logit_opacities": logit(s["opacities"]),
-        "sh_dc": s["sh"][:, :3],
-        "sh_rest": s["sh"][:, 3:],
-        "logit_base_color": logit(s["base_color"]),
-        "logit_roughness": logit(s["roughness"]),
-        "logit_metallic": logit(s["metallic"]),
-        "delta_normal": s["delta_normal"],
-        "curvature": s["curvature"],
-    }
-    assert {*given, "centers"} == set(SURFEL_PARAMETERS)
-    for name, value in given.items():
-        learned.set(name, value)
-    learned.two_sided = surfels.two_sided
-    return learned
-
-
 @pytest.mark.parametrize("two_sided", [True, False])
 def test_a_window_asks_for_all_that_it_lists_and_little_else(two_sided):
     surfels = sphere_surfels(3000, scale=0.5)
     surfels.two_sided = two_sided
-    learned, left = model(surfels), []
+    learned, left = model_of(surfels), []
     for k in range(6):
         camera = orbit_camera(angle=k, size=(160, 120))
         for window in ((0, 0, 160, 120), (40, 30, 64, 40), (100, 80, 40, 32)):
@@ -189,7 +164,7 @@ def test_a_window_asks_for_all_that_it_lists_and_little_else(two_sided):
 
 def test_what_a_window_shows_has_the_gradients_of_all_surfels():
     surfels, camera = sphere_surfels(400), orbit_camera(size=(160, 120)).cropped(60, 40, 32, 24)
-    learned = model(surfels)
+    learned = model_of(surfels)
 
     def loss(some):
         maps = render_gbuffer(some, camera).all

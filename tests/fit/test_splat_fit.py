@@ -8,11 +8,11 @@ import pytest
 from rgs_mi.core.color import to_8bit
 from rgs_mi.datasets.types import View
 from rgs_mi.evaluation.metrics import psnr
-from rgs_mi.fit.model import logit
 from rgs_mi.fit.splats import SplatFit
 from rgs_mi.splat.ellipses import DILATIONS, render_ellipses
 from rgs_mi.surfels.surfels import SH_0, Surfels
 
+from fits import model_of
 from scenes import orbit_camera, sphere_surfels
 
 SIZE, MINUTES = (64, 48), 0.12
@@ -28,19 +28,6 @@ def shown(surfels, camera, dilation=DILATIONS[0]):
 
 def over_white(image):
     return np.clip(image[..., :3] * image[..., 3:] + 1 - image[..., 3:], 0, 1)
-
-
-def parameters(surfels):
-    """The parameters of a model that has these ``surfels``."""
-    fields = surfels.numpy()
-    return {
-        "centers": fields["centers"],
-        "rotations": fields["rotations"],
-        "log_scales": np.log(fields["scales"]),
-        "logit_opacities": logit(fields["opacities"]),
-        "sh_dc": fields["sh"][:, :3],
-        "sh_rest": fields["sh"][:, 3:],
-    }
 
 
 @pytest.fixture
@@ -67,7 +54,7 @@ def test_finds_what_pictures_show(true, views):
             "scales": 0.7 * fields["scales"],
         }
     )
-    fit = SplatFit(views, parameters(spoiled), MINUTES, 400, extent=1.0)
+    fit = SplatFit(views, model_of(spoiled), MINUTES, 400, extent=1.0)
     while fit.progress < 1:
         fit.step()
     found = fit.splats()
@@ -84,7 +71,7 @@ def test_finds_what_pictures_show(true, views):
 def test_coefficients_stay_where_viewers_hold_them(true, views):
     fields = true.numpy()
     glaring = Surfels.from_numpy(fields | {"sh": 3 * np.sign(fields["sh"])})
-    fit = SplatFit(views, parameters(glaring), MINUTES, 400, extent=1.0)
+    fit = SplatFit(views, model_of(glaring), MINUTES, 400, extent=1.0)
     fit.step()
     sh = fit.splats().numpy()["sh"]
     assert np.abs(sh[:, :3]).max() == np.float32(0.5 / SH_0) and np.abs(sh[:, 3:]).max() == 1
@@ -95,7 +82,7 @@ def test_coefficients_stay_where_viewers_hold_them(true, views):
 
 
 def test_budget_is_kept(true, views):
-    fit = SplatFit(views, parameters(true), MINUTES, 230, extent=1.0)
+    fit = SplatFit(views, model_of(true), MINUTES, 230, extent=1.0)
     while fit.progress < 1:
         fit.step()
     assert 150 < len(fit.model) <= 230

@@ -11,7 +11,7 @@ from rgs_mi.splat.ellipses import CUTOFFS, DILATIONS, render_ellipses
 from rgs_mi.splat.reference import render_ellipses_reference
 from rgs_mi.surfels.surfels import Surfels
 
-from scenes import layered_surfels, orbit_camera, sphere_surfels
+from scenes import VARIED_CAMERAS, layered_surfels, orbit_camera, sphere_surfels
 
 FIELDS = "centers", "rotations", "scales", "opacities", "sh"
 SMOOTH = replace(CUTOFFS, alpha_min=1e-7, alpha_max=0.9999, transmittance_min=0)
@@ -24,17 +24,7 @@ def rendered(surfels, camera, dilation, whole=None):
 
 
 @pytest.mark.parametrize("dilation", DILATIONS)
-@pytest.mark.parametrize(
-    "camera",
-    [
-        orbit_camera(),
-        orbit_camera(2.0, (37, 53)),
-        orbit_camera(1.0, (64, 64), distance=1.9),
-        replace(orbit_camera(0.7), principal=(11.0, 31.0)),
-        replace(orbit_camera(0.2), focal=(90.0, 50.0)),
-    ],
-    ids=["plain", "odd size", "near", "principal point", "anisotropic pixels"],
-)
+@pytest.mark.parametrize("camera", VARIED_CAMERAS.values(), ids=VARIED_CAMERAS)
 @pytest.mark.parametrize("scale", [0.6, 0.03], ids=["wide", "less than a pixel"])
 def test_forward_equals_reference(camera, dilation, scale):
     surfels = sphere_surfels(150, seed=3, scale=scale, order=3)

@@ -13,7 +13,7 @@ from rgs_mi.splat.reference import render_gbuffer_reference
 from rgs_mi.splat.tiles import Cutoffs
 from rgs_mi.surfels.surfels import CHANNELS, Surfels, rotation_from_normal
 
-from scenes import layered_surfels, orbit_camera, sphere_surfels, tangent_surfels
+from scenes import VARIED_CAMERAS, layered_surfels, orbit_camera, sphere_surfels, tangent_surfels
 
 MAPS = ("diffuse", "normal", "base_color", "roughness", "metallic", "delta_normal", "depth", "square", "alpha")
 SORTED = Cutoffs(resort_window=96)  # more than the surfels of any tile here that overlap
@@ -51,17 +51,7 @@ def gradients(render, surfels, camera, weights):
     return result
 
 
-@pytest.mark.parametrize(
-    "camera",
-    [
-        orbit_camera(),
-        orbit_camera(2.0, (37, 53)),
-        orbit_camera(1.0, (64, 64), distance=1.6),
-        replace(orbit_camera(0.7), principal=(11.0, 31.0)),
-        replace(orbit_camera(0.2), focal=(90.0, 50.0)),
-    ],
-    ids=["plain", "odd size", "inside reach", "principal point", "anisotropic pixels"],
-)
+@pytest.mark.parametrize("camera", VARIED_CAMERAS.values(), ids=VARIED_CAMERAS)
 @pytest.mark.parametrize("count", [40, 300])
 def test_forward_equals_reference(camera, count):
     surfels = sphere_surfels(count, seed=count)
