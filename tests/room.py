@@ -91,9 +91,9 @@ def directions(count, split):
     return np.stack([np.sqrt(1 - z**2) * np.cos(azimuth), np.sqrt(1 - z**2) * np.sin(azimuth), z], -1)
 
 
-def render(target, out):
-    """Write the data set; what is there already stays."""
-    scene = load_scene(TARGETS / f"{target}.xml", {})
+def render(target, variables, out):
+    """Write the data set of a ``target`` with these ``variables``; what is there already stays."""
+    scene = load_scene(TARGETS / f"{target}.xml", variables)
     center, radius = bounds(scene)
     floor = float(np.array(scene.bbox().min).ravel()[2])
     shapes = {f"object{k}": shape for k, shape in enumerate(scene.shapes())}
@@ -158,6 +158,9 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--object", default="helmet")
+    parser.add_argument(
+        "-D", action="append", default=[], dest="variables", metavar="NAME=VALUE", help="a variable of its scene"
+    )
     parser.add_argument("--masked", type=Path, metavar="FROM")
     parser.add_argument("--score", type=Path, metavar="RUN")
     args = parser.parse_args()
@@ -167,7 +170,7 @@ def main():
     elif args.masked:
         mask(args.masked, args.data)
     else:
-        render(args.object, args.data)
+        render(args.object, dict(word.split("=", 1) for word in args.variables), args.data)
 
 
 if __name__ == "__main__":

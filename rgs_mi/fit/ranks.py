@@ -17,6 +17,7 @@ import mitsuba as mi
 
 from ..core.errors import UserError
 from ..core.runtime import cores
+from .shared_sum import SharedSum
 
 T = TypeVar("T")
 _PATIENCE = timedelta(days=1)  # of processes that wait for one that evaluates, or that a person has paused
@@ -28,9 +29,9 @@ class Ranks:
     All must call the same methods in the same order. Raises, from each: UserError where another process has ended.
     """
 
-    def __init__(self, rank: int = 0, size: int = 1, here: int = 1) -> None:
+    def __init__(self, rank: int = 0, size: int = 1, here: int = 1, shared: SharedSum | None = None) -> None:
         self.rank, self.size = rank, size
-        self._here = here  # processes of this machine
+        self._here, self._shared = here, shared  # processes of this machine, and what adds up where several share one
 
     @contextmanager
     def sharing_cores(self) -> Iterator[None]:
@@ -49,15 +50,10 @@ class Ranks:
         the same everywhere; they travel as one. Those that are None stay None."""
         if self.size == 1:
             return list(arrays)
-        import torch.distributed
-
         there = [array for array in arrays if array is not None]
         flat = [a.array if dr.is_tensor_v(a) else a for a in there]
-        together: Any = dr.concat(flat)
-        dr.eval(together)
         with _together(self):
-            torch.distributed.all_reduce(shared := together.torch())
-        together, means, first = mi.Float(shared) / self.size, [], 0
+            together, means, first = self._sum(flat) / self.size, [], 0
         for array, part in zip(there, flat):
             own = dr.gather(mi.Float, together, dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, dr.width(part)))
             means.append(type(array)(own, array.shape) if dr.is_tensor_v(array) else own)
@@ -65,6 +61,21 @@ class Ranks:
         dr.eval(means)
         ordered = iter(means)
         return [None if array is None else next(ordered) for array in arrays]
+
+    def _sum(self, arrays):
+        """The sum over all processes of flat ``arrays``, one after the other."""
+        if self._shared:
+            dr.eval(arrays)
+            try:
+                return mi.Float(self._shared.sum([array.numpy() for array in arrays]))
+            except OSError:
+                self._shared = None
+        from torch import distributed
+
+        together: Any = dr.concat(arrays)
+        dr.eval(together)
+        distributed.all_reduce(shared := together.torch())
+        return mi.Float(shared)
 
     def gather(self, value: T) -> list[T]:
         """Return what each process gives as ``value``, in their order; anything that can be pickled."""
@@ -105,7 +116,9 @@ def started() -> Iterator[Ranks]:
     store = distributed.PrefixStore(f"start {_starts()}", store)  # which still has the addresses of those before a restart
     distributed.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=_PATIENCE)
     try:
-        yield Ranks(rank, size, int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+        here = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+        several = backend == "gloo" and max(Ranks(rank, size).gather(here)) > 1
+        yield Ranks(rank, size, here, SharedSum() if several else None)
     finally:
         distributed.destroy_process_group()
 

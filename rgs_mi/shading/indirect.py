@@ -44,7 +44,7 @@ class Indirect:
     kind                   what a ray brings from a surfel that it meets: nothing, or that surfel's radiance
     proxies                the quads that rays meet, perhaps of a few steps ago
     surfels                the surfels as they are, all that rays may meet
-    irradiance_visibility  a of (9), one entry per surfel (None: 1 for all)
+    irradiance_visibility  a of (9), one entry per surfel (None: 1 for all), 1 beyond the box
     """
 
     kind: Literal["visibility", "one_bounce"]
@@ -81,15 +81,21 @@ class Indirect:
         """Return the same with `irradiance_visibility`, where surfels are lit by ``lighting``, whose estimator is the split
         sum; not differentiated."""
         with dr.suspend_grad():
-            ratio, normal = self._irradiance_visibility, self.surfels.normals()
-            visibility = ratio(normal, lighting, seed)
-            if self.surfels.two_sided:  # the side that shows is the one that light reaches
-                visibility = dr.maximum(visibility, ratio(-normal, lighting, seed))
+            n, center = len(self.surfels), self.surfels.column(mi.Vector3f, "centers")
+            visibility = dr.full(mi.Color3f, 1, n)
+            lit = dr.arange(mi.UInt32, n) if lighting.box is None else dr.compress(lighting.box.contains(center))
+            if dr.width(lit) > 0:
+                of_lit = lambda v: dr.gather(type(v), v, lit)
+                center, normal = of_lit(center), of_lit(self.surfels.normals())
+                found = self._irradiance_visibility(center, normal, lighting, seed)
+                if self.surfels.two_sided:  # the side that shows is the one that light reaches
+                    found = dr.maximum(found, self._irradiance_visibility(center, -normal, lighting, seed))
+                dr.scatter(visibility, found, lit)
             dr.eval(visibility)
         return replace(self, irradiance_visibility=visibility)
 
-    def _irradiance_visibility(self, normal, lighting, seed):
-        n, coming, radiance = len(self.surfels), mi.Color3f(0), mi.Color3f(0)
+    def _irradiance_visibility(self, center, normal, lighting, seed):
+        n, coming, radiance = dr.width(center), mi.Color3f(0), mi.Color3f(0)
         rounds = 1 if lighting.turntable is None else _TURNS
         while n * _RAYS > rounds * _MOST_RAYS and rounds < _RAYS:
             rounds *= 2
@@ -98,7 +104,7 @@ class Indirect:
         surfel = index // each
         at = lambda v: dr.gather(type(v), v, surfel)
         total = lambda color: mi.Color3f(*(dr.block_sum(c, each) for c in color))
-        normal, point = at(normal), at(self.surfels.column(mi.Vector3f, "centers"))
+        normal, point = at(normal), at(center)
         for k in range(rounds):
             light = lighting.turned(dr.opaque(mi.Float, 2 * np.pi * k / rounds))
             sample = index % each + dr.opaque(mi.UInt32, k * each)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from rgs_mi.core.bounding_box import BoundingBox
 from rgs_mi.core.camera import Camera
 from rgs_mi.shading import deferred, indirect
 from rgs_mi.shading.environment import Environment
@@ -298,6 +299,18 @@ def test_hidden_light_of_many_surfels_is_found_in_rounds(monkeypatch):
     monkeypatch.setattr(indirect, "_MOST_RAYS", 5 * len(surfels))  # of 32 for each
     assert together.min() < 0.7 < together.mean()
     np.testing.assert_allclose(of(), together, atol=1e-5)
+
+
+def test_hidden_light_is_asked_for_in_the_box_alone():
+    surfels = corner()
+    light = lighting(surfels, "visibility", lit=True)
+    of = lambda box: replace(light, box=box).with_irradiance_visibility(3).indirect.irradiance_visibility.numpy()[0]
+    everywhere, inside = of(None), surfels.numpy()["centers"][:, 0] < 0
+    part = of(BoundingBox((-9, -9, -9), (0, 9, 9)))
+    assert everywhere[inside].min() < 0.8 and everywhere[~inside].min() < 0.8
+    assert (part[~inside] == 1).all() and abs(part - everywhere)[inside].mean() < 0.06  # 32 rays, others
+    assert (part - everywhere)[inside].mean() == pytest.approx(0, abs=3e-3)
+    assert (of(BoundingBox((8, 8, 8), (9, 9, 9))) == 1).all()
 
 
 @pytest.mark.parametrize("kind", ["visibility", "one_bounce"])
