@@ -1,4 +1,4 @@
-"""How much memory this process may still take."""
+"""How much memory this process has, and may still take."""
 
 import os
 from collections.abc import Iterator
@@ -9,6 +9,14 @@ def available() -> int | None:
     """Return how many bytes this process may still take: the least of what the machine has free, what its control groups (of a
     container or a batch system) leave, and its own limits; None where the system says none of it."""
     return min([*_machine(), *_groups(), *_limits()], default=None)
+
+
+def held() -> int | None:
+    """Return how many bytes of memory this process holds now; None where the system does not say."""
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, ValueError, IndexError):
+        return None
 
 
 def words(size: float) -> str:

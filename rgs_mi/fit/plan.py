@@ -11,8 +11,8 @@ from ..datasets.types import Dataset, View
 from ..settings.settings import Settings, Stage
 
 _SURFELS, _A_MINUTE, _MOST = 50_000, 5_000, 150_000  # surfels at least, and a minute, and at most by minutes alone
-_PHOTOGRAPHED, _UNMASKED = 15_000, 25_000  # a minute at most, of photographs, and of those without masks
-_MOST_UNMASKED = 250_000  # more need time that each is then seen too rarely in, and memory
+_PHOTOGRAPHED, _UNMASKED = 15_000, 40_000  # a minute at most, of photographs, and of those without masks
+_MOST_UNMASKED = 400_000  # more need time that each is then seen too rarely in, and memory
 _FIRST = 25_000  # surfels to start with, at least
 _COARSEST, _FINEST_FROM = 220, 0.2  # side of a square of as many pixels, about; the part of the fit before full resolution
 _SAMPLED_FROM, _SPP = 0.85, 4  # the part of a fit before steps take more samples of a pixel, and how many they take then
@@ -37,7 +37,7 @@ def planned(settings: Settings, dataset: Dataset) -> Settings:
     """Return ``settings`` with numbers where they leave open what suits the photographs of ``dataset``:
 
     - `density.max_surfels`: 50 000, or 5000 a minute up to 150 000; of photographs, which have relief, as many as one shows
-      pixels of the object, in the mean, if that is more; but 15 000 a minute at most, and 25 000, up to 250 000, where they
+      pixels of the object, in the mean, if that is more; but 15 000 a minute at most, and 40 000, up to 400 000, where they
       have no masks;
     - `initialization.surfels`: half of these, or three quarters where photographs have no masks; 25 000 at least;
     - `mask_rim`: of photographs, as far within their masks as the object begins (`rims.rim`);

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..core import memory
 from ..core.arrays import as_float
 from ..core.film import Film
 from ..core.runtime import release_memory
@@ -34,6 +35,7 @@ _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table 
 _HIDE = 4  # such trees from one time that it is asked what surfels hide of the light to the next
 _PACE = 31  # steps whose median says how long one takes
 _DIVERGED = 10  # steps in a row without a finite error
+_KEPT = 1 << 30  # bytes that Dr.Jit may keep of arrays that steps have freed: others seldom are as large as these were
 
 
 @dataclass
@@ -85,6 +87,7 @@ class Fit:
         self.step_number, self.views_used, self.elapsed = 0, 0, 0.0
         self.psnr, self._failures = 0.0, 0
         self._level: _Level | None = None
+        self._held = memory.held()  # when freed arrays were last given back
         # Of some steps ago: what reflected rays meet, what surfels hide of the light, and what samples the light
         self.proxies: Proxies | None = None
         self.irradiance_visibility: mi.Color3f | None = None
@@ -244,7 +247,7 @@ class Fit:
             )
         if self._level is None or stage != self._level.stage:
             self._level = _Level(stage)
-            release_memory()  # of arrays of sizes that do not come again
+            self._release_memory()
         self._follow_schedule()
         views = self._next_views(stage.views * self.ranks.size)[self.ranks.rank :: self.ranks.size]
         surfels = self.model.scene(self.sh_order)
@@ -266,11 +269,17 @@ class Fit:
             self.turns.step(mean_rows(self.ranks.gather(self.turns.gradients())), self.schedule.turn_rate(progress))
         self.step_number += 1
         self._control_density()
+        if self._held is not None and memory.held() > self._held + _KEPT:
+            self._release_memory()
         seconds = self.ranks.same(time.monotonic() - start)
         self.elapsed += seconds
         self._level.note(seconds)
         state = {"step": self.step_number, "seconds": self.elapsed, "surfels": len(self.model), "pixels": pixels}
         return self.curves.add(self.progress, state, {"psnr": self.psnr, "ms": 1e3 * seconds} | mean)
+
+    def _release_memory(self):
+        release_memory()
+        self._held = memory.held()
 
     def _follow_schedule(self):
         """Bring rates, and rows of the environment, to where they should be by now."""

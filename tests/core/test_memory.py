@@ -2,6 +2,7 @@
 
 import resource
 
+import numpy as np
 import pytest
 
 from rgs_mi.core import memory
@@ -19,6 +20,12 @@ def groups(tmp_path, line, files):
 
 def test_machine():
     assert 1 << 26 < memory.available() < 1 << 45 and memory.words(2_560_000_000) == "2.6 GB"
+
+
+def test_what_is_held_grows_with_what_is_written():
+    before = memory.held()
+    array = np.ones(10_000_000)
+    assert memory.held() - before == pytest.approx(array.nbytes, rel=0.2)
 
 
 def test_control_groups(tmp_path):

@@ -35,10 +35,10 @@ def with_pixels(dataset, count, masked=False):
         (10, 4, False, True, 50_000),
         (30, 1, False, True, 150_000),
         (10, 4, False, False, 50_000),
-        (3, 4, True, False, 75_000),
+        (2, 4, True, False, 80_000),
         (10, 4, True, False, 83 * 75 * 16),
-        (30, 8, True, False, 250_000),
-        (60, 8, True, False, 250_000),
+        (30, 9, True, False, 400_000),
+        (60, 9, True, False, 400_000),
         (60, 8, False, True, 150_000),
     ],
 )

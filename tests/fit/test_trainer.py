@@ -15,7 +15,7 @@ from rgs_mi.core.film import Film
 from rgs_mi.datasets.photographs import Photographs
 from rgs_mi.datasets.types import DepthPrior
 from rgs_mi.evaluation.evaluate import render_view
-from rgs_mi.fit import losses, objective, schedule
+from rgs_mi.fit import losses, objective, schedule, trainer
 from rgs_mi.fit.density import Statistics
 from rgs_mi.fit.light_maps import STEPS, LightMaps
 from rgs_mi.fit.trainer import Fit
@@ -544,3 +544,19 @@ def test_opacities_to_start_with(dataset, where, opacity):
     np.testing.assert_allclose(surfels.opacities.numpy(), opacity, rtol=1e-5)
     settings = replace(settings, initialization=replace(settings.initialization, opacity=0.4))
     np.testing.assert_allclose(start(scene, data, settings).model.surfels(0).opacities.numpy(), 0.4, rtol=1e-5)
+
+
+def test_gives_memory_back_that_steps_have_freed(dataset, monkeypatch):
+    """Once a GiB more is held than when that was done last; a system that does not say what is held is left alone."""
+    held, released = iter([1.0, 1.5, 1.9, 2.4, 2.6, 1.2, 2.1]), []
+    monkeypatch.setattr(trainer.memory, "held", lambda: int(next(held) * 2**30))
+    monkeypatch.setattr(trainer, "release_memory", lambda: released.append(fit.step_number))
+    fit = Fit(dataset, model(), SETTINGS, 1.0)
+    for _ in range(4):
+        fit.step()
+    assert released == [0, 3]
+    monkeypatch.setattr(trainer.memory, "held", lambda: None)
+    fit = Fit(dataset, model(), SETTINGS, 1.0)
+    fit.step()
+    fit.step()
+    assert released == [0, 3, 0]
