@@ -11,12 +11,12 @@ def available() -> int | None:
     return min([*_machine(), *_groups(), *_limits()], default=None)
 
 
-def held() -> int | None:
-    """Return how many bytes of memory this process holds now; None where the system does not say."""
+def held() -> int:
+    """Return how many bytes of memory this process holds now; 0 where the system does not say."""
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError, IndexError):
-        return None
+    except OSError:
+        return 0
 
 
 def words(size: float) -> str:

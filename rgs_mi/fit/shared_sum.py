@@ -6,6 +6,7 @@ import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -67,9 +68,9 @@ class SharedSum:
             if path:
                 os.unlink(path)
 
-    def _all(self, value):
+    def _all(self, value) -> list[Any]:
         """What each process says, in their order."""
-        values = [None] * self._distributed.get_world_size()
+        values: list[Any] = [None] * self._distributed.get_world_size()
         self._distributed.all_gather_object(values, value)
         return values
 

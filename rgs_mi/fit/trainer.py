@@ -269,7 +269,7 @@ class Fit:
             self.turns.step(mean_rows(self.ranks.gather(self.turns.gradients())), self.schedule.turn_rate(progress))
         self.step_number += 1
         self._control_density()
-        if self._held is not None and memory.held() > self._held + _KEPT:
+        if memory.held() > self._held + _KEPT:
             self._release_memory()
         seconds = self.ranks.same(time.monotonic() - start)
         self.elapsed += seconds

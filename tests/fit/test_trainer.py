@@ -555,7 +555,7 @@ def test_gives_memory_back_that_steps_have_freed(dataset, monkeypatch):
     for _ in range(4):
         fit.step()
     assert released == [0, 3]
-    monkeypatch.setattr(trainer.memory, "held", lambda: None)
+    monkeypatch.setattr(trainer.memory, "held", lambda: 0)
     fit = Fit(dataset, model(), SETTINGS, 1.0)
     fit.step()
     fit.step()
