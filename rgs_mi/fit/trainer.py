@@ -35,7 +35,7 @@ _REBUILD = 50  # steps from one tree of what reflected rays meet, and one table 
 _HIDE = 4  # such trees from one time that it is asked what surfels hide of the light to the next
 _PACE = 31  # steps whose median says how long one takes
 _DIVERGED = 10  # steps in a row without a finite error
-_KEPT = 1 << 30  # bytes that Dr.Jit may keep of arrays that steps have freed: others seldom are as large as these were
+_KEPT = 3 << 29  # bytes that Dr.Jit may keep of arrays that steps have freed: others seldom are as large as these were
 
 
 @dataclass

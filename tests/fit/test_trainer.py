@@ -547,8 +547,8 @@ def test_opacities_to_start_with(dataset, where, opacity):
 
 
 def test_gives_memory_back_that_steps_have_freed(dataset, monkeypatch):
-    """Once a GiB more is held than when that was done last; a system that does not say what is held is left alone."""
-    held, released = iter([1.0, 1.5, 1.9, 2.4, 2.6, 1.2, 2.1]), []
+    """Once a GiB and a half more is held than when that was done last; a system that does not say what is held is left alone."""
+    held, released = iter([1.0, 1.5, 2.4, 2.9, 3.1, 1.2, 2.6]), []
     monkeypatch.setattr(trainer.memory, "held", lambda: int(next(held) * 2**30))
     monkeypatch.setattr(trainer, "release_memory", lambda: released.append(fit.step_number))
     fit = Fit(dataset, model(), SETTINGS, 1.0)
