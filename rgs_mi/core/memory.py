@@ -14,8 +14,8 @@ def available() -> int | None:
 def held() -> int:
     """Return how many bytes of memory this process holds now; 0 where the system does not say."""
     try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except OSError:
+        return _of_process()[1]
+    except (OSError, ValueError):
         return 0
 
 
@@ -68,11 +68,16 @@ def _limits() -> Iterator[int]:
     try:
         import resource
 
-        total, *_, data, _ = map(int, Path("/proc/self/statm").read_text().split())
+        total, *_, data, _ = _of_process()
     except (ImportError, OSError, ValueError):
         return
-    page = os.sysconf("SC_PAGE_SIZE")
     for kind, used in ((resource.RLIMIT_AS, total), (resource.RLIMIT_DATA, data)):
         soft, _ = resource.getrlimit(kind)
         if soft != resource.RLIM_INFINITY:
-            yield max(soft - page * used, 0)
+            yield max(soft - used, 0)
+
+
+def _of_process() -> list[int]:
+    """Bytes of this process, in the order of Linux's ``statm``: its addresses, what it holds in memory, …, its data, 0."""
+    page = os.sysconf("SC_PAGE_SIZE")
+    return [page * int(pages) for pages in Path("/proc/self/statm").read_text().split()]

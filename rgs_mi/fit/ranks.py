@@ -117,8 +117,10 @@ def started() -> Iterator[Ranks]:
     distributed.init_process_group(backend, store=store, rank=rank, world_size=size, timeout=_PATIENCE)
     try:
         here = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-        several = backend == "gloo" and max(Ranks(rank, size).gather(here)) > 1
-        yield Ranks(rank, size, here, SharedSum() if several else None)
+        gather, shared = Ranks(rank, size).gather, None
+        if backend == "gloo" and max(gather(here)) > 1:
+            shared = SharedSum(int(os.environ["LOCAL_RANK"]), here, gather)
+        yield Ranks(rank, size, here, shared)
     finally:
         distributed.destroy_process_group()
 

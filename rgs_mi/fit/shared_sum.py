@@ -2,9 +2,11 @@
 goes through the loopback device."""
 # pyright: reportPrivateImportUsage=false
 
+import math
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +20,17 @@ class SharedSum:
     """The sum over all processes that torchrun has started, which must make one of these, and call `sum`, in the same order.
 
     Each process of a machine writes a row, and adds up its share of the rows; the first one of each machine then adds what
-    others have there.
+    others have there. ``number`` of ``here`` is this process on its machine; ``gather`` is `Ranks.gather`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, number: int, here: int, gather: Callable[[Any], list[Any]]) -> None:
         from torch import distributed
 
-        self._distributed = distributed
-        self._rank, self._size = int(os.environ["LOCAL_RANK"]), int(os.environ["LOCAL_WORLD_SIZE"])
-        firsts = [rank for rank, number in enumerate(self._all(self._rank)) if number == 0]
+        self._distributed, self._gather = distributed, gather
+        self._number, self._here = number, here
+        firsts = [rank for rank, other in enumerate(gather(number)) if other == 0]
         self._firsts = distributed.new_group(firsts) if len(firsts) > 1 else None
-        self._rows = np.zeros((self._size + 1, 0), np.float32)  # of each process of this machine, and the sum
+        self._rows = np.zeros((here + 1, 0), np.float32)  # of each process of this machine, and the sum
 
     def sum(self, parts: Sequence[np.ndarray]) -> np.ndarray:
         """Return the sum of flat arrays of floats, which are as long everywhere, one after the other; to be read before the next
@@ -37,15 +39,15 @@ class SharedSum:
         if n > self._rows.shape[1]:
             self._share(int(_ROOM * n))
         *rows, total = self._rows[:, :n]
-        np.concatenate(parts, out=rows[self._rank])
+        np.concatenate(parts, out=rows[self._number])
         self._distributed.barrier()
-        part = slice(n * self._rank // self._size, n * (self._rank + 1) // self._size)
+        part = slice(n * self._number // self._here, n * (self._number + 1) // self._here)
         total[part] = rows[0][part]
         for row in rows[1:]:
             total[part] += row[part]
         self._distributed.barrier()
         if self._firsts:
-            if self._rank == 0:
+            if self._number == 0:
                 import torch
 
                 self._distributed.all_reduce(torch.from_numpy(total), group=self._firsts)
@@ -54,25 +56,20 @@ class SharedSum:
 
     def _share(self, n):
         """Share rows of ``n`` floats. Their file loses its name once all have it, and goes when they end, however they do."""
-        first, path = self._rank == 0, None
-        if first:
-            path = _file((self._size + 1) * n * 4)
-        paths = self._all(path if first else "")
+        shape, own, rows = (self._here + 1, n), None, None
         try:
-            if None in paths:
-                raise OSError("no memory to share")
-            own = paths[self._distributed.get_rank() - self._rank]
-            self._rows = np.memmap(own, np.float32, "r+", shape=(self._size + 1, n))
-            self._distributed.barrier()
-        finally:
+            if self._number == 0:
+                own = _file(4 * math.prod(shape))
+            path = self._gather(own)[self._distributed.get_rank() - self._number]
             if path:
-                os.unlink(path)
-
-    def _all(self, value) -> list[Any]:
-        """What each process says, in their order."""
-        values: list[Any] = [None] * self._distributed.get_world_size()
-        self._distributed.all_gather_object(values, value)
-        return values
+                with suppress(OSError):
+                    rows = np.memmap(path, np.float32, "r+", shape=shape)
+            if not all(self._gather(rows is not None)):
+                raise OSError("no memory to share")
+        finally:
+            if own:
+                os.unlink(own)
+        self._rows = rows
 
 
 def _file(size):
