@@ -69,6 +69,7 @@ class SharedSum:
         finally:
             if own:
                 os.unlink(own)
+        assert rows is not None
         self._rows = rows
 
 
