@@ -1,5 +1,6 @@
 """Function calls in processes of their own: their memory goes back, their crash is not ours, Ctrl-C lets them save."""
 
+import contextlib
 import multiprocessing
 import os
 import signal
@@ -104,12 +105,14 @@ def _work(send, variant, threads, function, arguments):
             set_variant(variant)
             if threads:
                 dr.set_thread_count(threads)
-            send.send((function(*arguments), None))
+            end = function(*arguments), None
         except UserError as error:
-            send.send((None, str(error)))
+            end = None, str(error)
         except Exception as error:
             traceback.print_exc()
-            send.send((None, f"{type(error).__name__}: {' '.join(str(error).split())}"))
+            end = None, f"{type(error).__name__}: {' '.join(str(error).split())}"
+        with contextlib.suppress(BrokenPipeError):  # nobody hears of it any more
+            send.send(end)
 
     os.setpgrp()  # out of reach of the terminal's Ctrl-C
     threading.Thread(target=_end_with_parent, daemon=True).start()
