@@ -23,7 +23,7 @@ from ..core.runtime import cache_folder
 from ..datasets.rims import without_rim
 from ..datasets.types import Dataset
 from ..export.mitsuba_scene import SCENE
-from ..fit import checkpoint, events, light
+from ..fit import checkpoint, events, light, walls
 from ..fit.model import Model
 from ..fit.plan import planned, told
 from ..fit.ranks import Ranks
@@ -210,7 +210,7 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
             points.appearance.metallic,
             settings.shader,
             two_sided=None if box is None else True,
-            room=(center, settings.room * extent) if settings.room else None,
+            room=None if settings.room is None else (center, np.multiply(settings.room, extent)),
             specular=specular if learns_specular else None,
         )
         fit = Fit(shown, model, settings, extent, shading, _priors(shown, settings))
@@ -221,6 +221,7 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
     if settings.light == "auto":
         settings = light.tried(fit_of, dataset, settings, quiet)
     settings = light.ring_turns(fit_of, dataset, settings, quiet)
+    settings = walls.near_room(fit_of, dataset, settings, quiet)
     return fit_of(dataset, settings)
 
 

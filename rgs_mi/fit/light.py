@@ -75,7 +75,7 @@ def tried(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, settings
     scores = {}
     with Progress(quiet=quiet, label="world or turntable") as progress:
         for k, light in enumerate(("world", "turntable")):
-            fit = fit_of(shown, _short(settings, light))
+            fit = fit_of(shown, short(settings, light))
             while fit.progress < 1:
                 fit.step()
                 progress.update((k + fit.progress) / 2)
@@ -103,7 +103,7 @@ def ring_turns(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, set
     first = max(range(count), key=lambda k: len(members[k]))
     turns = [0.0] * count
     with Progress(quiet=quiet, label="lamps of the rings") as progress:
-        fit = fit_of(replace(dataset, train=members[first]), _short(settings, "turntable"))
+        fit = fit_of(replace(dataset, train=members[first]), short(settings, "turntable"))
         while fit.progress < 1:
             fit.step()
             progress.update(0.8 * fit.progress)
@@ -123,8 +123,8 @@ def ring_turns(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, set
     return replace(settings, turns=tuple(turn - turns[0] for turn in turns))
 
 
-def _short(settings, light):
-    """Settings of a fit that is to tell which light it is."""
+def short(settings: Settings, light: str) -> Settings:
+    """Return the settings of a fit that is to tell which ``light`` it is."""
     assert settings.stages, "`plan.planned` gives them"
     return replace(
         settings,

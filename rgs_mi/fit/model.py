@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import numpy.typing as npt
 
 from ..core.arrays import as_float, as_tensor
 from ..core.camera import Camera
@@ -91,7 +92,7 @@ class Model:
         metallic: np.ndarray | float = 0.4,
         shader: str = "identity",
         two_sided: bool | None = None,
-        room: tuple[np.ndarray | Sequence[float], float] | None = None,
+        room: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
         specular: float | None = None,
     ) -> "Model":
         """Make the model that a fit starts with.
@@ -106,7 +107,7 @@ class Model:
           opacity, roughness, metallic: of all surfels; metallic may be [N], of each
           shader:      'identity' or 'mlp', as in `Settings`
           two_sided:   see `Surfels` (None: where normals are random; others point outwards)
-          room:        center and distance of the walls on which the environment is painted (None: it is at infinity)
+          room:        center, and distance of all walls or of each, on which the environment is painted (None: it is at infinity)
           specular:    (22) of `shading/tables.py`, which is learned (None: it is given)
         """
         from ..surfels.surfels import rotation_from_normal
@@ -133,7 +134,7 @@ class Model:
                 "curvature": np.zeros((n, 3)),
                 ENVIRONMENT: np.log(np.maximum(environment, 1e-3)),
                 **({SHADER: initial_weights(seed)} if shader == "mlp" else {}),
-                **({ROOM: np.full(len(SIDES), -np.log(room[1]))} if room else {}),
+                **({ROOM: np.broadcast_to(-np.log(room[1]), len(SIDES)).copy()} if room else {}),
                 **({} if specular is None else {SPECULAR: np.full(1, logit(specular))}),
             },
             rotation,

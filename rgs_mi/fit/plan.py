@@ -30,6 +30,7 @@ _OPEN = (
     "box",
     "light",
     "turns",
+    "room",
 )  # settings that a fit decides on where they are not given
 
 

@@ -25,6 +25,7 @@ Fraction = Annotated[float, Field(ge=0, le=1)]
 #: From which to which part of the fit.
 Period = Annotated[tuple[Fraction, Fraction], AfterValidator(_in_order)]
 #: A weight at the beginning and at the end, joined geometrically.
+Wall = Annotated[float, Field(gt=0, le=1e6)]
 WeightPair = tuple[Annotated[float, Field(ge=0, le=1e3)], Annotated[float, Field(ge=0, le=1e3)]]
 
 
@@ -335,12 +336,11 @@ class Settings:
         description="Degrees by which the lamps of each ring of cameras around a turntable, lowest first, are turned, because "
         "someone has moved the camera among them. Unless given, a short fit to the largest ring tells; then they are learned.",
     )
-    room: float | None = Field(
+    room: Literal["auto"] | Wall | tuple[Wall, Wall, Wall, Wall, Wall, Wall] | None = Field(
         default=None,
-        gt=0,
-        le=1e6,
-        description="The light is painted on the walls of a room, so many radii of the object from its middle at first; from "
-        "`refine_start` on they are learned. Unless given, it is at infinity.",
+        description="The light is painted on the walls of a room, at first so many radii of the object from its middle: one "
+        "number, one for each wall (-x, +x, -y, +y, -z, +z of the environment's frame), or what two short fits tell, if they do "
+        "(auto). From `refine_start` on they are learned. Unless given, the light is at infinity.",
     )
     cameras: Literal["fixed", "learned"] = Field(
         default="fixed",

@@ -57,6 +57,19 @@ def behind(camera: Camera, environment: FilteredEnvironment, turntable: Turntabl
     return environment.eval(rays, point=opaque(camera).origin)
 
 
+def surface(gbuffer: GBuffer, camera: Camera, index: "mi.UInt32") -> Surface:
+    """Return the mean of the surfaces that ``camera`` sees in the pixels ``index``, row-major, their points included."""
+    return _surface(gbuffer.maps(index), camera, index, True)
+
+
+def _surface(m, camera, index, near):
+    """`surface` of the maps ``m``, with points where it is ``near``."""
+    mean, direction = dr.rcp(m.alpha), pixel_directions(camera, index)
+    point = _points(camera, direction, m.depth * mean) if near else None
+    normal = dr.normalize(m.normal)
+    return Surface(normal, -direction, m.roughness * mean, m.metallic * mean, m.base_color * mean, point)
+
+
 def _points(camera, direction, depth):
     """World-space points along unit ``direction`` at a ``depth`` (z)."""
     seen = opaque(camera, dr.width(direction))
@@ -72,13 +85,10 @@ def _reflected(gbuffer, camera, lighting):
         diffuse = dr.select(shaded, 0, diffuse)
     if dr.width(index) > 0:
         m, lighting = gbuffer.maps(index), lighting.seen_by(camera, dr.width(index))
-        mean = dr.rcp(m.alpha)
-        normal, direction = dr.normalize(m.normal), pixel_directions(camera, index)
-        point = _points(camera, direction, m.depth * mean) if lighting.near else None
-        surface = Surface(normal, -direction, m.roughness * mean, m.metallic * mean, m.base_color * mean, point)
-        dr.scatter(specular, lighting.specular(surface) * m.alpha, index)
+        seen = _surface(m, camera, index, lighting.near)
+        dr.scatter(specular, lighting.specular(seen) * m.alpha, index)
         if lighting.lit:
-            lit = lighting.diffuse(surface, lighting.irradiance_visibility(m.diffuse * mean))
+            lit = lighting.diffuse(seen, lighting.irradiance_visibility(m.diffuse * dr.rcp(m.alpha)))
             dr.scatter(diffuse, lit * m.alpha, index)
     return diffuse, specular
 

@@ -167,8 +167,8 @@ class FilteredEnvironment:
         return mi.Color3f(value.x, value.y, value.z)
 
     @staticmethod
-    def _coordinates(d):
-        """(longitude, colatitude) of a unit vector in the emitter's frame, in [0, 1]."""
+    def coordinates(d: "mi.Vector3f") -> "tuple[mi.Float, mi.Float]":
+        """Return (longitude, colatitude) of a unit vector in the emitter's frame, in [0, 1]."""
         # atan2 and acos have no derivative at the poles, where longitude does not matter: stay clear of them
         horizontal = dr.maximum(dr.square(d.x) + dr.square(d.z), 1e-10)
         longitude = dr.atan2(d.x, dr.select(dr.abs(d.z) + dr.abs(d.x) > 1e-5, -d.z, 1e-5)) / dr.two_pi
@@ -186,7 +186,7 @@ class FilteredEnvironment:
         lobe of ``roughness`` (None: unfiltered), whose width on the map is that on the wall, as the map's center sees it:
         r² becomes r²/s of (14) in `room.py`. ``point`` None is the room's center."""
         local, farther, _ = self.environment.seen(direction, point)
-        longitude, colatitude = self._coordinates(local)
+        longitude, colatitude = self.coordinates(local)
         if roughness is None:
             return self._level(longitude, colatitude, mi.UInt32(0))
         seen = roughness if self.environment.room is None else roughness * dr.rsqrt(farther)
@@ -205,4 +205,4 @@ class FilteredEnvironment:
         """Return radiance averaged over the cosine lobe around world-space unit ``normal`` at ``point`` (see `eval`):
         irradiance by π."""
         local, _, _ = self.environment.seen(normal, point)
-        return self._level(*self._coordinates(local), mi.UInt32(len(_prefilter.LEVELS)))
+        return self._level(*self.coordinates(local), mi.UInt32(len(_prefilter.LEVELS)))

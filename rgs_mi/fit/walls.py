@@ -1,0 +1,167 @@
+"""How far the walls of a near room stand, told by what several photographs show reflected.
+
+As if surfaces were mirrors, a pixel that shows C, of which C_d is diffuse, shows of the environment
+
+    L = (C − C_d) / E,                                                                                                 (23)
+
+E the albedo of (4) in `shading/tables.py`. Walls put it into the texel t of ω' of (14) in `shading/room.py`. Where they stand
+right all that was seen of a spot of a wall is alike, so that those are sought which have the least
+
+    V = Σ_i w_i (y_i − ȳ_t(i))² n_t(i) / (n_t(i) − 1) / Σ_i w_i,   y = log(ε + L),   w = E,                            (24)
+
+with n_t how many pixels show t. No environment is in it that was fitted among other walls, and with which gradients would stay.
+Normals have to be those of the start on the hull: a fit to light at infinity bends them until they explain what they show by it.
+"""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..core.color import srgb_decode
+from ..core.progress import Progress
+from ..core.runtime import release_memory
+from ..datasets.photographs import Photographs
+from ..datasets.types import Dataset
+from ..settings.settings import Settings
+from ..shading import deferred
+from ..shading.environment import FilteredEnvironment
+from ..shading.room import SIDES, Room
+from ..shading.split_sum import albedo
+from ..shading.tables import specular_of
+from .light import short
+from .trainer import Fit
+
+_ROUNDS = 2  # short fits, the first to light at infinity
+_ROWS = 64  # of the map whose texels are compared
+_SHARP, _LEAST_ALBEDO, _WHITE, _OPAQUE = 0.25, 0.1, 0.99, 0.98  # of what counts: rougher, darker, whiter is left out
+_EPSILON, _FEWEST = 0.05, 3  # ε, and the pixels of a texel that counts
+_FACTORS = 1.5, 1.2, 1.1, 1.05  # from one distance to the next, finer and finer
+_ALL = 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0  # radii of the object, of all walls at first
+_BOUNDS = 1.0, 32.0  # the least and the largest, of a wall the object stands on half as much
+_CLEAR = 0.95  # of the variance of light at infinity that walls may have
+
+
+@dataclass(frozen=True)
+class Reflections:
+    """What pixels show of the environment: ``log_radiance`` and ``weight`` are y and w of (24); ``direction`` and ``q`` those
+    of (14)."""
+
+    direction: "mi.Vector3f"
+    q: "mi.Vector3f"
+    log_radiance: "mi.Color3f"
+    weight: "mi.Float"
+
+    @classmethod
+    def seen_by(cls, fit: Fit) -> "Reflections":
+        """Those that the training photographs of a ``fit`` show at its resolution."""
+        s = fit.settings
+        photographs = Photographs(fit.dataset.train, fit.stage.downscale, s.background, rim=s.mask_rim)
+        with dr.suspend_grad():
+            surfels = fit.model.surfels(fit.sh_order)
+            lighting = fit.lighting(surfels)
+            assert lighting is not None, "something is specular"
+            found = [_shown(fit, surfels, lighting, photographs.tile(k)) for k in range(len(fit.dataset.train))]
+        direction, q, light, weight = (np.ascontiguousarray(np.concatenate(parts, -1), np.float32) for parts in zip(*found))
+        return cls(mi.Vector3f(direction), mi.Vector3f(q), mi.Color3f(np.log(_EPSILON + light)), mi.Float(weight))
+
+    def __len__(self) -> int:
+        return dr.width(self.weight)
+
+    def variance(self, distances: np.ndarray) -> float:
+        """V of (24) for walls at six ``distances`` from the center (`SIDES`), in world units."""
+        room = Room((0.0, 0.0, 0.0), mi.Float([float(1 / d) for d in distances]))
+        longitude, colatitude = FilteredEnvironment.coordinates(room.seen(self.direction, self.q)[0])
+        row = dr.minimum(mi.UInt32(colatitude * _ROWS), _ROWS - 1)
+        texel = row * (2 * _ROWS) + dr.minimum(mi.UInt32(longitude * (2 * _ROWS)), 2 * _ROWS - 1)
+        n, weight = self._sum(texel, mi.Float(1)), self._sum(texel, self.weight)
+        mean = [self._sum(texel, self.weight * y) / dr.maximum(weight, 1e-9) for y in self.log_radiance]
+        off = [dr.square(y - dr.gather(mi.Float, m, texel)) for y, m in zip(self.log_radiance, mean)]
+        squares = self._sum(texel, self.weight * (off[0] + off[1] + off[2]) / 3) * n / dr.maximum(n - 1, 1)
+        counts = n >= _FEWEST
+        return float((dr.sum(dr.select(counts, squares, 0)) / dr.sum(dr.select(counts, weight, 0)))[0])
+
+    def _sum(self, texel, values):
+        sums = dr.zeros(mi.Float, 2 * _ROWS * _ROWS)
+        dr.scatter_reduce(dr.ReduceOp.Add, sums, values, texel)
+        return sums
+
+
+def _shown(fit, surfels, lighting, photograph):
+    """Of one photograph ω [3, n] and q [3, n] of (14), L [3, n] and w [n]."""
+    camera = photograph.camera
+    image = deferred.render(surfels, camera, lighting)
+    inside = deferred.within(image.gbuffer, camera, lighting.box) & (image.gbuffer.all.alpha > _OPAQUE)
+    index = dr.compress(inside & (dr.max(photograph.color) < _WHITE))
+    surface = deferred.surface(image.gbuffer, camera, index)
+    environment = lighting.seen_by(camera, dr.width(index)).estimator.environment.environment
+    specular = dr.opaque(mi.Float, specular_of(fit.shading.eta))
+    E, _ = albedo(surface.cosine, surface.roughness, surface.metallic, surface.base_color, specular)
+    direction = environment.to_local(2 * surface.cosine * surface.normal - surface.view)
+    q = environment.to_local(surface.point - mi.Point3f(*map(float, fit.model.center)))
+    at = lambda image: np.array(dr.gather(mi.Color3f, image, index))
+    E, weight = np.array(E), np.array(dr.mean(E))
+    light = (srgb_decode(at(photograph.color)) - at(image.diffuse)) / np.maximum(E, _EPSILON)
+    counts = (np.array(surface.roughness) < _SHARP) & (weight > _LEAST_ALBEDO)
+    return [a[..., counts] for a in (np.array(direction), np.array(q), np.maximum(light, 0), weight)]
+
+
+def nearest(reflections: Reflections, extent: float) -> tuple[np.ndarray, float]:
+    """Return (distances [6], part): of the walls (`SIDES`), in world units, that have the least variance (24), and what part of
+    that of light at infinity it is. ``extent`` is the object's radius. All at once, then each by itself, closer and closer."""
+    far = reflections.variance(np.full(len(SIDES), np.inf))
+    tried = {d: reflections.variance(np.full(len(SIDES), d * extent)) for d in _ALL}
+    first = min(tried, key=lambda d: tried[d])
+    distances, least = np.full(len(SIDES), first * extent), tried[first]
+    for factor in _FACTORS:
+        moved = True
+        while moved:
+            moved = False
+            for side in range(len(SIDES)):
+                for times in (factor, 1 / factor):
+                    other = distances.copy()
+                    other[side] *= times
+                    if _BOUNDS[0] / 2 <= other[side] / extent <= _BOUNDS[1] and (v := reflections.variance(other)) < least:
+                        distances, least, moved = other, v, True
+    return distances, least / far
+
+
+def near_room(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, settings: Settings, quiet: bool) -> Settings:
+    """Return ``settings`` with a `room` in the place of 'auto': the walls that `Reflections` tell, of a short fit to light at
+    infinity, as ``fit_of`` starts one, then of another among the walls so found; none where what is reflected is not clearly
+    more alike among them. It tells of it."""
+    if settings.room != "auto":
+        return settings
+    if settings.specular_start >= 1:
+        return replace(settings, room=None)
+    rates = replace(settings.learning_rates, rotations=(0, 0), delta_normal=(0, 0), curvature=(0, 0), room=(0, 0))
+    walls, part = None, 1.0
+    with Progress(quiet=quiet, label="walls of the room") as progress:
+        for k in range(_ROUNDS):
+            trial = replace(short(settings, settings.light), exposure="fixed", turns=settings.turns)
+            trial = replace(trial, learning_rates=rates, room=walls)
+            fit = fit_of(dataset, trial)
+            while fit.progress < 1:
+                fit.step()
+                progress.update((k + fit.progress) / _ROUNDS)
+            reflections = Reflections.seen_by(fit)
+            if len(reflections) == 0:
+                break
+            distances, part = nearest(reflections, fit.extent)
+            walls = tuple(float(d) for d in distances / fit.extent)
+            del fit
+            release_memory()
+            if part > _CLEAR:
+                break
+    clear = part <= _CLEAR
+    if not quiet:
+        found = (
+            f"among walls what is reflected differs {part:.2f} times as much from view to view as under light at infinity"
+        )
+        listing = ", ".join(f"{side} {d:.1f}" for side, d in zip(SIDES, walls or ()))
+        chosen = f"a room, walls at {listing} radii of the object" if clear else "light at infinity"
+        print(f"{found}: {chosen} (--set room=… changes it)", file=sys.stderr)
+    return replace(settings, room=walls if clear else None)
