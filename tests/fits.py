@@ -1,9 +1,11 @@
 """A model and photographs of random surfels, which several tests fit."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from rgs_mi.core.camera import Camera
 from rgs_mi.datasets.types import Dataset, View
 from rgs_mi.fit import losses
 from rgs_mi.fit.model import SURFEL_PARAMETERS, Model
@@ -11,9 +13,9 @@ from rgs_mi.settings.settings import Density, Initialization, Settings, Stage
 from rgs_mi.shading import deferred
 from rgs_mi.shading.lighting import Lighting
 from rgs_mi.shading.split_sum import SplitSum
-from rgs_mi.surfels.surfels import Surfels, sh_order
+from rgs_mi.surfels.surfels import SH_0, Surfels, sh_order
 
-from scenes import orbit_camera, sphere_surfels
+from scenes import orbit_camera, sphere_surfels, tangent_surfels
 
 SETTINGS = Settings(
     minutes=None,
@@ -79,3 +81,27 @@ def random_photographs(distance=9.0) -> Dataset:
         pixels = np.clip(np.concatenate([straight, alpha], 2) * 255 + 0.5, 0, 255).astype(np.uint8)
         views.append(View(f"r_{k}", camera, pixels, True, None, Path(f"r_{k}.png")))
     return Dataset(views, [])
+
+
+def mirror_ball(n: int = 600) -> Surfels:
+    """``n`` surfels of a ball of radius 1 that is nearly a mirror, without light of its own."""
+    surfels = tangent_surfels(n, curvature=(1, 0, 1)).numpy()
+    surfels |= {
+        "metallic": np.full((n, 1), 0.95),
+        "roughness": np.full((n, 1), 0.15),
+        "opacities": np.full((n, 1), 0.98),
+    }
+    surfels |= {"base_color": np.full((n, 3), 0.9), "sh": np.full((n, 3), -0.5 / SH_0)}
+    return Surfels.from_numpy(surfels, two_sided=False)
+
+
+def photographs(surfels: Surfels, lighting: Lighting, cameras: Sequence[Camera], masked: bool = True) -> list[View]:
+    """Photographs of ``surfels`` over black."""
+    views = []
+    for k, camera in enumerate(cameras):
+        image = deferred.render(surfels, camera, lighting)
+        alpha, (width, height) = image.gbuffer.all.alpha, camera.size
+        shown = losses.display(image.color, alpha, 0.0).numpy().T / np.maximum(alpha.numpy()[:, None], 0.05)
+        rgba = np.concatenate([shown, alpha.numpy()[:, None]], 1).reshape(height, width, 4)
+        views.append(View(f"{k}", camera, np.uint8(255 * np.clip(rgba, 0, 1) + 0.5), masked, None, Path(f"{k}.png")))
+    return views

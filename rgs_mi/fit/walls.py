@@ -2,12 +2,12 @@
 
 As if surfaces were mirrors, a pixel that shows C, of which C_d is diffuse, shows of the environment
 
-    L = (C − C_d) / E,                                                                                                 (23)
+    L = (C − C_d) / E,                                                                                                 (27)
 
 E the albedo of (4) in `shading/tables.py`. Walls put it into the texel t of ω' of (14) in `shading/room.py`. Where they stand
 right all that was seen of a spot of a wall is alike, so that those are sought which have the least
 
-    V = Σ_i w_i (y_i − ȳ_t(i))² n_t(i) / (n_t(i) − 1) / Σ_i w_i,   y = log(ε + L),   w = E,                            (24)
+    V = Σ_i w_i (y_i − ȳ_t(i))² n_t(i) / (n_t(i) − 1) / Σ_i w_i,   y = log(ε + L),   w = E,                            (28)
 
 with n_t how many pixels show t. No environment is in it that was fitted among other walls, and with which gradients would stay.
 Normals have to be those of the start on the hull: a fit to light at infinity bends them until they explain what they show by it.
@@ -36,7 +36,7 @@ from .light import short
 from .trainer import Fit
 
 _ROUNDS = 2  # short fits, the first to light at infinity
-_ROWS = 64  # of the map whose texels are compared
+_ROWS, _A_TEXEL = (16, 64), 20  # rows, at least and at most, of the map whose texels are compared; pixels in one of them
 _SHARP, _LEAST_ALBEDO, _WHITE, _OPAQUE = 0.25, 0.1, 0.99, 0.98  # of what counts: rougher, darker, whiter is left out
 _EPSILON, _FEWEST = 0.05, 3  # ε, and the pixels of a texel that counts
 _FACTORS = 1.5, 1.2, 1.1, 1.05  # from one distance to the next, finer and finer
@@ -47,7 +47,7 @@ _CLEAR = 0.95  # of the variance of light at infinity that walls may have
 
 @dataclass(frozen=True)
 class Reflections:
-    """What pixels show of the environment: ``log_radiance`` and ``weight`` are y and w of (24); ``direction`` and ``q`` those
+    """What pixels show of the environment: ``log_radiance`` and ``weight`` are y and w of (28); ``direction`` and ``q`` those
     of (14)."""
 
     direction: "mi.Vector3f"
@@ -71,12 +71,17 @@ class Reflections:
     def __len__(self) -> int:
         return dr.width(self.weight)
 
+    @property
+    def rows(self) -> int:
+        """Of the map, twice as wide, whose texels are compared."""
+        return int(np.clip(np.sqrt(len(self) / (2 * _A_TEXEL)), *_ROWS))
+
     def variance(self, distances: np.ndarray) -> float:
-        """V of (24) for walls at six ``distances`` from the center (`SIDES`), in world units."""
-        room = Room((0.0, 0.0, 0.0), mi.Float([float(1 / d) for d in distances]))
+        """V of (28) for walls at six ``distances`` from the center (`SIDES`), in world units."""
+        room, rows = Room((0.0, 0.0, 0.0), mi.Float([float(1 / d) for d in distances])), self.rows
         longitude, colatitude = FilteredEnvironment.coordinates(room.seen(self.direction, self.q)[0])
-        row = dr.minimum(mi.UInt32(colatitude * _ROWS), _ROWS - 1)
-        texel = row * (2 * _ROWS) + dr.minimum(mi.UInt32(longitude * (2 * _ROWS)), 2 * _ROWS - 1)
+        row = dr.minimum(mi.UInt32(colatitude * rows), rows - 1)
+        texel = row * (2 * rows) + dr.minimum(mi.UInt32(longitude * (2 * rows)), 2 * rows - 1)
         n, weight = self._sum(texel, mi.Float(1)), self._sum(texel, self.weight)
         mean = [self._sum(texel, self.weight * y) / dr.maximum(weight, 1e-9) for y in self.log_radiance]
         off = [dr.square(y - dr.gather(mi.Float, m, texel)) for y, m in zip(self.log_radiance, mean)]
@@ -85,7 +90,7 @@ class Reflections:
         return float((dr.sum(dr.select(counts, squares, 0)) / dr.sum(dr.select(counts, weight, 0)))[0])
 
     def _sum(self, texel, values):
-        sums = dr.zeros(mi.Float, 2 * _ROWS * _ROWS)
+        sums = dr.zeros(mi.Float, 2 * self.rows**2)
         dr.scatter_reduce(dr.ReduceOp.Add, sums, values, texel)
         return sums
 
@@ -110,7 +115,7 @@ def _shown(fit, surfels, lighting, photograph):
 
 
 def nearest(reflections: Reflections, extent: float) -> tuple[np.ndarray, float]:
-    """Return (distances [6], part): of the walls (`SIDES`), in world units, that have the least variance (24), and what part of
+    """Return (distances [6], part): of the walls (`SIDES`), in world units, that have the least variance (28), and what part of
     that of light at infinity it is. ``extent`` is the object's radius. All at once, then each by itself, closer and closer."""
     far = reflections.variance(np.full(len(SIDES), np.inf))
     tried = {d: reflections.variance(np.full(len(SIDES), d * extent)) for d in _ALL}
@@ -148,7 +153,7 @@ def near_room(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, sett
                 fit.step()
                 progress.update((k + fit.progress) / _ROUNDS)
             reflections = Reflections.seen_by(fit)
-            if len(reflections) == 0:
+            if len(reflections) < _A_TEXEL * 2 * _ROWS[0] ** 2:
                 break
             distances, part = nearest(reflections, fit.extent)
             walls = tuple(float(d) for d in distances / fit.extent)

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -19,20 +18,17 @@ from rgs_mi.core.files import write_json
 from rgs_mi.core.scene_files import find_scene, load_scene
 from rgs_mi.core.turntable import Turntable
 from rgs_mi.datasets.path_traced import train_directions
-from rgs_mi.datasets.types import Dataset, View
+from rgs_mi.datasets.types import Dataset
 from rgs_mi.export.relight import relight
 from rgs_mi.export.render import straight
-from rgs_mi.fit import light, losses
+from rgs_mi.fit import light
 from rgs_mi.fit.scene import FitScene
 from rgs_mi.fit.trainer import Fit
 from rgs_mi.settings.settings import Settings, Stage
-from rgs_mi.shading import deferred
 from rgs_mi.shading.environment import Environment
 from rgs_mi.shading.lighting import Shading, lighting_of
-from rgs_mi.surfels.surfels import SH_0, Surfels
 
-from fits import SETTINGS, model
-from scenes import tangent_surfels
+from fits import SETTINGS, mirror_ball, model, photographs
 
 ELEVATIONS, COUNT, SIZE, MOVED = (10, 40), 10, 48, 50.0
 ONE_STAGE = replace(SETTINGS, iterations=60, stages=(Stage(1.0, 1, 1),), specular_start=0.0)
@@ -50,28 +46,14 @@ def cameras(directions=None):
 @cache
 def capture(turned, moved=0.0, masked=True):
     """Photographs of a mirror ball from two rings, under lamps that stand still, or go round with the camera."""
-    surfels = tangent_surfels(600, curvature=(1, 0, 1)).numpy()
-    surfels |= {
-        "metallic": np.full((600, 1), 0.95),
-        "roughness": np.full((600, 1), 0.15),
-        "opacities": np.full((600, 1), 0.98),
-    }
-    surfels |= {"base_color": np.full((600, 3), 0.9), "sh": np.full((600, 3), -0.5 / SH_0)}
-    ball = Surfels.from_numpy(surfels, two_sided=False)
+    ball = mirror_ball()
     noise = ndimage.gaussian_filter(np.random.default_rng(1).normal(size=(32, 64, 3)), (3, 3, 0), mode="wrap")
     lamps = Environment(
         mi.TensorXf(np.float32(np.exp(2 * noise / noise.std()) / 3)), np.eye(3)[[0, 2, 1]] * [[1], [1], [-1]]
     )
     table = Turntable((0, 0, 1), (0, 0, 0), ((ELEVATIONS[0], 0.0), (ELEVATIONS[1], moved)))
     lighting = lighting_of(Shading(turntable=table if turned else None), ball, lamps.filtered())
-    views = []
-    for k, camera in enumerate(cameras()):
-        image = deferred.render(ball, camera, lighting)
-        alpha = image.gbuffer.all.alpha
-        shown = losses.display(image.color, alpha, 0.0).numpy().T / np.maximum(alpha.numpy()[:, None], 0.05)
-        rgba = np.concatenate([shown, alpha.numpy()[:, None]], 1).reshape(SIZE, SIZE, 4)
-        views.append(View(f"{k}", camera, np.uint8(255 * np.clip(rgba, 0, 1) + 0.5), masked, None, Path(f"{k}.png")))
-    return Dataset(views, [])
+    return Dataset(photographs(ball, lighting, cameras(), masked), [])
 
 
 def fit_of(shown, settings, whole=None):
