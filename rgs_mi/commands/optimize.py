@@ -289,9 +289,10 @@ def _resume(saved, scene, dataset, settings, folder) -> Fit:
 
 
 def _gone_on_with(arrays, meta, scene, dataset, settings):
-    for name in ("box", "light", "turns", "mask_rim"):  # what was decided at the start
-        if getattr(settings, name) in (None, "auto") and (value := meta["settings"].get(name)) is not None:
-            settings = replace(settings, **{name: tuple(value) if isinstance(value, list) else value})
+    for name in ("box", "light", "turns", "mask_rim", "room"):  # what was decided at the start
+        asked, found = getattr(settings, name), meta["settings"].get(name)
+        if asked == "auto" or (asked is None and name != "room"):  # whose None is light at infinity
+            settings = replace(settings, **{name: tuple(found) if isinstance(found, list) else found})
     settings = planned(settings, dataset)
     if meta["digests"]["photographs"] != dataset.digest:
         raise UserError(f"{dataset.root}: not the photographs of the checkpoint: give its --data, or another --out")

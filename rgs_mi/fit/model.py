@@ -92,7 +92,7 @@ class Model:
         metallic: np.ndarray | float = 0.4,
         shader: str = "identity",
         two_sided: bool | None = None,
-        room: tuple[npt.ArrayLike, npt.ArrayLike] | None = None,
+        room: tuple[np.ndarray | Sequence[float], npt.ArrayLike] | None = None,
         specular: float | None = None,
     ) -> "Model":
         """Make the model that a fit starts with.

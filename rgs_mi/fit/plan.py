@@ -28,9 +28,7 @@ _OPEN = (
     "mask_rim",
     "rfilter",
     "box",
-    "light",
     "turns",
-    "room",
 )  # settings that a fit decides on where they are not given
 
 
@@ -98,7 +96,7 @@ def agree(asked: Mapping, saved: Mapping) -> bool:
     def same(own, there):
         if isinstance(own, Mapping) and isinstance(there, Mapping):
             return own.keys() == there.keys() and all(
-                same(own[name], there[name]) or (name in _OPEN and own[name] in (None, "auto")) for name in own
+                same(own[name], there[name]) or own[name] == "auto" or (name in _OPEN and own[name] is None) for name in own
             )
         return own == there
 

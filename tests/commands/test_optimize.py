@@ -5,6 +5,7 @@ import re
 import shutil
 import signal
 import subprocess
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -16,7 +17,7 @@ from rgs_mi.commands.evaluate import reevaluate
 from rgs_mi.commands.export import export
 from rgs_mi.core.alignment import Similarity
 from rgs_mi.core.errors import UserError
-from rgs_mi.fit import checkpoint
+from rgs_mi.fit import checkpoint, walls
 from rgs_mi.fit.scene import FitScene
 from rgs_mi.fit.trainer import Fit
 from rgs_mi.surfels.ply import read_ply
@@ -217,6 +218,29 @@ def test_resume_after_a_crash(inputs, tmp_path, monkeypatch, capsys):
         fit(*inputs, tmp_path, overrides=[*SMALL, "sh_order=0"], resume=True)
     with pytest.raises(UserError, match="room is None in the checkpoint and can't change"):
         fit(*inputs, tmp_path, overrides=[*SMALL, "room=4"], resume=True)
+
+
+def test_walls_that_were_found_stay(inputs, tmp_path, monkeypatch):
+    found, step = (3.0, 3.0, 1.0, 4.0, 3.0, 3.5), Fit.step
+
+    def crash(self):
+        if self.step_number == 12:
+            raise RuntimeError("lights out")
+        step(self)
+
+    monkeypatch.setattr(walls, "near_room", lambda fit_of, dataset, settings, quiet: replace(settings, room=found))
+    monkeypatch.setattr(Fit, "step", crash)
+    auto = [*SMALL, "room=auto", "learning_rates.room=[0,0]"]
+    with pytest.raises(RuntimeError):
+        fit(*inputs, tmp_path, overrides=auto)
+    monkeypatch.undo()  # nothing is looked for again
+    with pytest.raises(UserError, match="room is .* can't change"):
+        fit(*inputs, tmp_path, overrides=SMALL, resume=True)
+    fit(*inputs, tmp_path, overrides=auto, resume=True)
+    stored = metrics(tmp_path)
+    assert tuple(stored["settings"]["room"]) == found
+    distances = np.array(list(stored["room"]["distances"].values()))
+    assert np.allclose(distances / distances[0], np.array(found) / found[0], rtol=1e-4)
 
 
 def test_a_finished_run_is_moved_aside(inputs, tmp_path, capsys):

@@ -93,6 +93,9 @@ def test_jobs_know_their_fits(dataset):
     assert not agree(to_dict(replace(asked, seed=1)), saved)
     assert not agree(to_dict(replace(asked, density=Density(max_surfels=9))), saved)
     assert not agree(to_dict(asked), {"minutes": 3})
+    walls = saved | {"room": [3.0] * 6}
+    assert agree(to_dict(replace(asked, room="auto")), walls) and agree(to_dict(replace(asked, room="auto")), saved)
+    assert not agree(to_dict(asked), walls)
 
 
 def test_what_is_decided_is_told(dataset):
