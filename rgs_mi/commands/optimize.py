@@ -7,6 +7,7 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -23,14 +24,14 @@ from ..core.runtime import cache_folder
 from ..datasets.rims import without_rim
 from ..datasets.types import Dataset
 from ..export.mitsuba_scene import SCENE
-from ..fit import checkpoint, events, light, walls
+from ..fit import checkpoint, events, foreground, light, walls
 from ..fit.model import Model
 from ..fit.plan import planned, told
 from ..fit.ranks import Ranks
 from ..fit.scene import FitScene
 from ..fit.trainer import Fit
 from ..priors import depth_priors
-from ..priors.initialization import initial_points, surroundings
+from ..priors.initialization import Points, initial_points, surroundings
 from ..priors.silhouettes import agreement
 from ..report import results
 from ..settings.config import to_dict
@@ -41,6 +42,7 @@ from ..viewer.live import Watch
 from .fit_line import FitLine
 
 _ON_SURFACE, _ANYWHERE = 0.7, 0.1  # opacities to start with; where surfels fill space, more would hide what is within
+_HIDING = 0.97  # on the hull of an object without masks, through which surroundings would be seen
 
 
 def optimize(
@@ -177,23 +179,13 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
     points = initial_points(placed, begin.surfels, settings.seed, begin.hull, begin.compare, quiet)
     random = points.normals is None and not (dataset.points is not None and len(dataset.points))
     opacity = begin.opacity or (_ANYWHERE if random else _ON_SURFACE)
-    if settings.box is None and not any(view.masked for view in dataset.train):
-        box = BoundingBox.seen_by([view.camera for view in dataset.train], None if random else points.positions)
-        settings = replace(settings, box=box.moved(dataset.origin).corners)
-    box = _box(settings, dataset)
-    if box is None:
-        extent = float(np.linalg.norm(points.positions - points.positions.mean(0), axis=1).max())
-    else:
-        extent = box.radius
-        points = _with_surroundings(points, dataset, settings)
-    points = points.in_places()
 
-    middle = points.positions.mean(0) if box is None else box.center
-
-    def fit_of(shown: Dataset, settings: Settings) -> Fit:
-        shading = _shading(scene, settings, dataset)
+    def fit_from(points: Points, shown: Dataset, settings: Settings) -> Fit:
+        shading, box = _shading(scene, settings, dataset), _box(settings, dataset)
         specular = specular_of(shading.eta)  # what it can't say, η from 1.79 on, stays as the scene has it
         learns_specular = shading.specular == "split_sum" and any(settings.learning_rates.specular) and specular < 1
+        middle = points.positions.mean(0) if box is None else box.center
+        extent = float(np.linalg.norm(points.positions - middle, axis=1).max()) if box is None else box.radius
         center = shading.turntable.point if shading.turntable else middle  # a room turns about its center
         model = Model.start(
             points.positions,
@@ -218,11 +210,36 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
             fit.cameras.begin([cameras[view.name] for view in shown.train])
         return fit
 
+    if settings.box is None and not any(view.masked for view in dataset.train):
+        box = BoundingBox.seen_by([view.camera for view in dataset.train], None if random else points.positions)
+        settings = _in_box(settings, box, dataset)
+        if begin.foreground and points.normals is not None and settings.specular_start < 1:
+            alone = lambda points, settings: fit_from(
+                _with_surroundings(points, dataset, settings).in_places(), placed, settings
+            )
+            if found := foreground.found(alone, placed, points, settings, box, quiet):
+                points, settings = found[0], _in_box(settings, found[1], dataset)
+                opacity = begin.opacity or _HIDING
+    shown = points.positions
+    if settings.box is not None:
+        points = _with_surroundings(points, dataset, settings)
+    fit_of = partial(fit_from, points.in_places())
     if settings.light == "auto":
         settings = light.tried(fit_of, dataset, settings, quiet)
     settings = light.ring_turns(fit_of, dataset, settings, quiet)
-    settings = walls.near_room(fit_of, dataset, settings, quiet)
+
+    def around() -> np.ndarray:
+        box = _box(settings, dataset)
+        local = (shown - box.center) @ np.linalg.inv(scene.environment.rotation).T
+        return walls.surrounding(local, box.radius) / box.radius
+
+    settings = walls.near_room(fit_of, dataset, settings, quiet, None if settings.box is None else around)
     return fit_of(dataset, settings)
+
+
+def _in_box(settings, box, dataset):
+    """The ``settings`` with a ``box``, which they have in the world of the files."""
+    return replace(settings, box=box.moved(dataset.origin).corners)
 
 
 def _begun_cameras(views, settings, quiet) -> dict[str, Camera]:

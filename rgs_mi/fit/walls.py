@@ -11,6 +11,13 @@ right all that was seen of a spot of a wall is alike, so that those are sought w
 
 with n_t how many pixels show t. No environment is in it that was fitted among other walls, and with which gradients would stay.
 Normals have to be those of the start on the hull: a fit to light at infinity bends them until they explain what they show by it.
+
+Photographs without masks show the walls themselves. Points p of what surrounds the object, seen from its middle along ω in so
+many directions, tell those walls, d_a along the axis a, that have the least
+
+    Σ_ω | log |p| − log min_a d_a / |ω_a| |,                                                                              (29)
+
+and (28) is asked of the others alone.
 """
 
 import sys
@@ -42,6 +49,10 @@ _EPSILON, _FEWEST = 0.05, 3  # ε, and the pixels of a texel that counts
 _FACTORS = 1.5, 1.2, 1.1, 1.05  # from one distance to the next, finer and finer
 _ALL = 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0  # radii of the object, of all walls at first
 _BOUNDS = 1.0, 32.0  # the least and the largest, of a wall the object stands on half as much
+_BEYOND, _CELLS = (
+    1.2,
+    24,
+)  # radii of the object from which on points are surroundings; cells along a side of a cube of directions
 _CLEAR = 0.95  # of the variance of light at infinity that walls may have
 
 
@@ -114,59 +125,125 @@ def _shown(fit, surfels, lighting, photograph):
     return [a[..., counts] for a in (np.array(direction), np.array(q), np.maximum(light, 0), weight)]
 
 
-def nearest(reflections: Reflections, extent: float) -> tuple[np.ndarray, float]:
+def nearest(reflections: Reflections, extent: float, known: np.ndarray | None = None) -> tuple[np.ndarray, float]:
     """Return (distances [6], part): of the walls (`SIDES`), in world units, that have the least variance (28), and what part of
-    that of light at infinity it is. ``extent`` is the object's radius. All at once, then each by itself, closer and closer."""
+    that of light at infinity it is. ``extent`` is the object's radius; ``known`` distances [6] stay (NaN: is looked for). All at
+    once, then each by itself, closer and closer."""
+    known = np.full(len(SIDES), np.nan) if known is None else known
     far = reflections.variance(np.full(len(SIDES), np.inf))
-    tried = {d: reflections.variance(np.full(len(SIDES), d * extent)) for d in _ALL}
-    first = min(tried, key=lambda d: tried[d])
-    distances, least = np.full(len(SIDES), first * extent), tried[first]
+    free = np.flatnonzero(np.isnan(known))
+    tried = [np.where(np.isnan(known), d * extent, known) for d in _ALL]
+    distances, least = _closer(reflections.variance, min(tried, key=reflections.variance), free, extent)
+    return distances, least / far
+
+
+def _closer(cost, distances, sides, extent):
+    """(distances [6], cost) of the least ``cost`` that a pattern search (Hooke and Jeeves 1961) finds from ``distances`` on,
+    moving the walls ``sides``."""
+    least = cost(distances)
     for factor in _FACTORS:
         moved = True
         while moved:
             moved = False
-            for side in range(len(SIDES)):
+            for side in sides:
                 for times in (factor, 1 / factor):
                     other = distances.copy()
                     other[side] *= times
-                    if _BOUNDS[0] / 2 <= other[side] / extent <= _BOUNDS[1] and (v := reflections.variance(other)) < least:
+                    if _BOUNDS[0] / 2 <= other[side] / extent <= _BOUNDS[1] and (v := cost(other)) < least:
                         distances, least, moved = other, v, True
-    return distances, least / far
+    return distances, least
 
 
-def near_room(fit_of: Callable[[Dataset, Settings], Fit], dataset: Dataset, settings: Settings, quiet: bool) -> Settings:
-    """Return ``settings`` with a `room` in the place of 'auto': the walls that `Reflections` tell, of a short fit to light at
-    infinity, as ``fit_of`` starts one, then of another among the walls so found; none where what is reflected is not clearly
-    more alike among them. It tells of it."""
+def surrounding(points: np.ndarray, extent: float) -> np.ndarray:
+    """Return the distances [6] of the walls (`SIDES`) that ``points`` [N, 3] of the surroundings tell by (29), in the units of
+    both, NaN where they do not. Points are relative to the middle of the object, whose radius is ``extent``, in the environment's
+    frame; what lies closer to the object is no wall."""
+    radius = np.linalg.norm(points, axis=1)
+    points, radius = points[radius > _BEYOND * extent], radius[radius > _BEYOND * extent]
+    direction = points / radius[:, None]
+    cell = np.floor((direction + 1) / 2 * _CELLS).astype(np.intp) @ (1, _CELLS + 1, (_CELLS + 1) ** 2)
+    _, cell, count = np.unique(cell, return_inverse=True, return_counts=True)
+    group = [np.flatnonzero(cell == k) for k in np.flatnonzero(count >= _FEWEST)]
+    if not group:
+        return np.full(len(SIDES), np.nan)
+    logs = np.array([np.median(np.log(radius[k])) for k in group])
+    along = np.array([direction[k].mean(0) for k in group])
+    ahead = 2 * np.arange(3) + (along > 0)  # [cells, 3] the wall along each axis
+    across = np.maximum(np.abs(along), 1e-9)
+    cost = lambda d: float(np.abs(logs - np.log((d[ahead] / across).min(1))).mean())
+    starts = [np.full(len(SIDES), d * extent) for d in _ALL]
+    distances, _ = _closer(cost, min(starts, key=cost), range(len(SIDES)), extent)
+    met = ahead[np.arange(len(group)), (distances[ahead] / across).argmin(1)]
+    return np.where(np.bincount(met, minlength=len(SIDES)) >= _FEWEST, distances, np.nan)
+
+
+def near_room(
+    fit_of: Callable[[Dataset, Settings], Fit],
+    dataset: Dataset,
+    settings: Settings,
+    quiet: bool,
+    seen: Callable[[], np.ndarray] | None = None,
+) -> Settings:
+    """Return ``settings`` with a `room` in the place of 'auto'. It tells of it.
+
+    Where photographs show the surroundings, the callback ``seen`` returns the walls that these tell (`surrounding`), in radii of
+    the object; those that they do not tell are looked for by `Reflections` of a short fit among the others, as ``fit_of`` starts
+    one. Else all are, of a short fit to light at infinity, then of another among the walls so found; and there are none where
+    what is reflected is not clearly more alike among them.
+    """
     if settings.room != "auto":
         return settings
     if settings.specular_start >= 1:
         return replace(settings, room=None)
-    rates = replace(settings.learning_rates, rotations=(0, 0), delta_normal=(0, 0), curvature=(0, 0), room=(0, 0))
+    known = np.full(len(SIDES), np.nan) if seen is None else seen()
+    if np.isnan(known).all():
+        walls, found = _mirrored(fit_of, dataset, settings, quiet)
+    else:
+        walls, found = _completed(fit_of, dataset, settings, known, quiet), "what surrounds the object is near"
+    listing = ", ".join(f"{side} {d:.1f}" for side, d in zip(SIDES, walls or ()))
+    chosen = f"a room, walls at {listing} radii of the object" if walls else "light at infinity"
+    if not quiet:
+        print(f"{found}: {chosen} (--set room=… changes it)", file=sys.stderr)
+    return replace(settings, room=walls)
+
+
+def _mirrored(fit_of, dataset, settings, quiet):
+    """The walls that mirrors tell, or None, and what was found."""
     walls, part = None, 1.0
     with Progress(quiet=quiet, label="walls of the room") as progress:
         for k in range(_ROUNDS):
-            trial = replace(short(settings, settings.light), exposure="fixed", turns=settings.turns)
-            trial = replace(trial, learning_rates=rates, room=walls)
-            fit = fit_of(dataset, trial)
-            while fit.progress < 1:
-                fit.step()
-                progress.update((k + fit.progress) / _ROUNDS)
-            reflections = Reflections.seen_by(fit)
+            done = lambda part, k=k: progress.update((k + part) / _ROUNDS)
+            reflections, extent = _reflections(fit_of, dataset, settings, walls, done)
             if len(reflections) < _A_TEXEL * 2 * _ROWS[0] ** 2:
                 break
-            distances, part = nearest(reflections, fit.extent)
-            walls = tuple(float(d) for d in distances / fit.extent)
-            del fit
-            release_memory()
+            distances, part = nearest(reflections, extent)
+            walls = tuple(float(d) for d in distances / extent)
             if part > _CLEAR:
                 break
-    clear = part <= _CLEAR
-    if not quiet:
-        found = (
-            f"among walls what is reflected differs {part:.2f} times as much from view to view as under light at infinity"
-        )
-        listing = ", ".join(f"{side} {d:.1f}" for side, d in zip(SIDES, walls or ()))
-        chosen = f"a room, walls at {listing} radii of the object" if clear else "light at infinity"
-        print(f"{found}: {chosen} (--set room=… changes it)", file=sys.stderr)
-    return replace(settings, room=walls if clear else None)
+    found = f"among walls what is reflected differs {part:.2f} times as much from view to view as under light at infinity"
+    return walls if part <= _CLEAR else None, found
+
+
+def _completed(fit_of, dataset, settings, known, quiet):
+    """The walls, some of which are ``known``, in radii of the object."""
+    walls = np.where(np.isnan(known), np.nanmedian(known), known)
+    if np.isnan(known).any():
+        with Progress(quiet=quiet, label="walls of the room") as progress:
+            reflections, extent = _reflections(fit_of, dataset, settings, tuple(map(float, walls)), progress.update)
+            if len(reflections) >= _A_TEXEL * 2 * _ROWS[0] ** 2:
+                walls = nearest(reflections, extent, known * extent)[0] / extent
+    return tuple(map(float, walls))
+
+
+def _reflections(fit_of, dataset, settings, walls, done):
+    """Those of a short fit among ``walls`` with the normals that it starts with, and the object's radius."""
+    rates = replace(settings.learning_rates, rotations=(0, 0), delta_normal=(0, 0), curvature=(0, 0), room=(0, 0))
+    trial = replace(short(settings, settings.light), exposure="fixed", turns=settings.turns)
+    fit = fit_of(dataset, replace(trial, learning_rates=rates, room=walls))
+    while fit.progress < 1:
+        fit.step()
+        done(fit.progress)
+    reflections, extent = Reflections.seen_by(fit), fit.extent
+    del fit
+    release_memory()
+    return reflections, extent

@@ -8,7 +8,7 @@ mislead it; concavities that no silhouette shows stay filled.
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage, special
@@ -247,17 +247,26 @@ def _field(silhouettes, box, resolution, outvoted=0):
     return SignedField(values, lower, step)
 
 
+def largest_piece(field: SignedField) -> SignedField:
+    """Return ``field`` with the largest of its connected pieces alone inside."""
+    pieces, count = ndimage.label(field.values > 0)
+    if count < 2:
+        return field
+    largest = 1 + np.argmax(np.bincount(pieces.ravel())[1:])
+    return replace(field, values=np.where((pieces > 0) & (pieces != largest), -field.step, field.values))
+
+
 # ---- The surface ----
 
 
-def surface(field: SignedField) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def surface(field: SignedField, over: float = 0.6) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the zero level of ``field`` by marching cubes: vertices [V, 3] (world), faces [F, 3] int32 (counter-clockwise
-    from outside), outward unit normals [V, 3]."""
+    from outside), outward unit normals [V, 3] of the field as it is smoothed ``over`` so many steps."""
     from skimage.measure import marching_cubes
 
     nodes, faces, _, _ = marching_cubes(field.values, 0.0, gradient_direction="ascent")
     # Min has creases where cones meet, and marching cubes slivers: a gradient over a few steps is a steadier normal.
-    smooth = ndimage.gaussian_filter(field.values, 0.6)
+    smooth = ndimage.gaussian_filter(field.values, over)
     beside = lambda offset: ndimage.map_coordinates(smooth, nodes.T + offset[:, None], order=1, mode="nearest")
     normals = np.stack([beside(-axis) - beside(axis) for axis in np.eye(3)], -1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)

@@ -1,13 +1,14 @@
 """Where the first surfels stand: on the visual hull, where photographs agree on a depth, on a sparse point cloud, or anywhere in
 view."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import spatial
+from scipy import ndimage, spatial
 
 from ..core.camera import focus_point
-from ..datasets.types import Dataset
+from ..datasets.types import Dataset, View
 from . import hull, stereo
 from .openings import COPIES, openings, seen_through
 from .photometric_variation import Appearance, appearance
@@ -18,6 +19,7 @@ _FAR = 10
 _DEEPER = 2  # area of what lies below the hull, over that of the hull that is seen through
 _A_WRONG_MASK = 32  # in so many photographs one mask may be wrong at any point
 _COMPARED = 120  # photographs at most that are compared: more say little more, and half a second goes into each
+_BESIDE = 1.5  # steps of the hull's grid that a point lies off it at least, which counts as beside it
 _FEW = 0.1  # of the points that are wanted: fewer that photographs agree on are no start
 
 
@@ -39,13 +41,16 @@ class Points(NamedTuple):
         look = (np.concatenate(pair) for pair in zip(self.appearance, others.appearance))
         return Points(positions, normals, spacing, Appearance._make(look))
 
+    def chosen(self, index: np.ndarray) -> "Points":
+        """Return the points of an ``index`` [M], or those for which it says True [N]."""
+        normals = None if self.normals is None else self.normals[index]
+        look = Appearance._make(values[index] for values in self.appearance)
+        return Points(self.positions[index], normals, self.spacing[index], look)
+
     def in_places(self) -> "Points":
         """Return the same points in an order in which those that follow one another are near one another: what a pixel sees then
         lies together in memory, too."""
-        order = spatial.KDTree(self.positions).indices
-        normals = None if self.normals is None else self.normals[order]
-        look = Appearance._make(values[order] for values in self.appearance)
-        return Points(self.positions[order], normals, self.spacing[order], look)
+        return self.chosen(spatial.KDTree(self.positions).indices)
 
 
 def initial_points(
@@ -100,6 +105,22 @@ def _on_hull(views, count, rng, compare, outvoted, quiet) -> Points:
         )
         if not gone.all():
             positions, normals = (np.concatenate([on[~gone], new]) for on, new in zip((positions, normals), below))
+    return _seen_on(mesh, positions, normals, views)
+
+
+def around_hull(
+    points: Points, views: Sequence[View], field: hull.SignedField, over: float, count: int, rng: np.random.Generator
+) -> Points:
+    """Return those of ``points`` that lie beside the hull that ``field`` is of, and ``count`` more on it, with normals that are
+    smoothed ``over`` so many steps, which ``views`` show without masks."""
+    node = (points.positions - field.lower) / field.step
+    inside = ndimage.map_coordinates(field.values, node.T, order=1, mode="constant", cval=-np.inf) > -_BESIDE * field.step
+    mesh = hull.surface(field, over)
+    return points.chosen(~inside).joined_with(_seen_on(mesh, *sample_surface(*mesh, count, rng), views))
+
+
+def _seen_on(mesh, positions, normals, views) -> Points:
+    """Points on a hull's ``mesh``, or below it, as the ``views`` show them."""
     spacing = spacing_of(positions)
     depths = hull.depth_maps(*mesh[:2], [view.camera for view in views])
     reach = 2 * float(np.median(spacing))

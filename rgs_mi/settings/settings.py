@@ -61,6 +61,11 @@ class Initialization:
         description="Photographs are compared first: surfels start where they agree on a depth, and not where they look through "
         "the hull.",
     )
+    foreground: bool = Field(
+        default=True,
+        description="Where photographs have no masks, a short fit tells what they show of an object, above the ground; surfels "
+        "start on the visual hull of that.",
+    )
     silhouettes: bool = Field(
         default=True,
         description="Where cameras are learned, poses begin where the photographs' masks agree, if they agree much better there "

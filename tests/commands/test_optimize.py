@@ -228,7 +228,7 @@ def test_walls_that_were_found_stay(inputs, tmp_path, monkeypatch):
             raise RuntimeError("lights out")
         step(self)
 
-    monkeypatch.setattr(walls, "near_room", lambda fit_of, dataset, settings, quiet: replace(settings, room=found))
+    monkeypatch.setattr(walls, "near_room", lambda fit_of, dataset, settings, *others: replace(settings, room=found))
     monkeypatch.setattr(Fit, "step", crash)
     auto = [*SMALL, "room=auto", "learning_rates.room=[0,0]"]
     with pytest.raises(RuntimeError):

@@ -82,6 +82,37 @@ def test_light_at_infinity_has_no_walls():
     assert walls.nearest(reflections(FAR), 1.0)[1] > walls._CLEAR
 
 
+def spots(distances, sides=range(6), n=4000):
+    """Points of the walls ``sides`` of a room, seen from its middle, a fifth of them elsewhere, and some on the object."""
+    rng = np.random.default_rng(2)
+    direction = rng.normal(size=(n, 3))
+    away = np.where(direction > 0, distances[1::2], distances[::2]) / np.abs(direction)
+    met = 2 * away.argmin(1) + (direction[np.arange(n), away.argmin(1)] > 0)
+    points = direction * away.min(1, keepdims=True) * np.where(rng.random(n) < 0.2, rng.uniform(0.3, 1.5, n), 1)[:, None]
+    thing = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    return np.concatenate([points[np.isin(met, list(sides))], thing])
+
+
+def test_walls_that_photographs_show_are_found():
+    np.testing.assert_allclose(walls.surrounding(spots(DISTANCES), 1.0), DISTANCES, rtol=0.05)
+    np.testing.assert_allclose(walls.surrounding(100 * spots(DISTANCES), 100.0), 100 * DISTANCES, rtol=0.05)
+
+
+def test_a_wall_that_no_photograph_shows_stays_unknown():
+    found = walls.surrounding(spots(DISTANCES, sides=(0, 1, 2, 4, 5)), 1.0)
+    assert np.isnan(found).tolist() == [False, False, False, True, False, False]
+    np.testing.assert_allclose(np.delete(found, 3), np.delete(DISTANCES, 3), rtol=0.05)
+    assert np.isnan(walls.surrounding(np.zeros((0, 3)), 1.0)).all()
+    assert np.isnan(walls.surrounding(spots(DISTANCES)[-50:], 1.0)).all()  # the object alone
+
+
+def test_mirrors_tell_the_wall_that_is_not_known():
+    known = np.where(np.arange(6) == 3, np.nan, DISTANCES)
+    distances, _ = walls.nearest(reflections(DISTANCES), 1.0, known)
+    np.testing.assert_array_equal(np.delete(distances, 3), np.delete(DISTANCES, 3))
+    assert distances[3] == pytest.approx(DISTANCES[3], rel=0.1)
+
+
 def capture(distances):
     """Photographs of a mirror ball in a room, or under light at infinity."""
     room = Room((0.0, 0.0, 0.0), mi.Float([float(1 / d) for d in distances]))
@@ -113,6 +144,15 @@ def test_short_fits_tell(monkeypatch, capfd, distances):
     else:
         assert np.abs(np.array(found) / distances - 1).max() < 0.08
         assert "a room, walls at -x" in said
+
+
+def test_walls_that_are_seen_are_taken(monkeypatch, capfd):
+    monkeypatch.setattr(light, "_STEPS", 100)
+    room = capture(DISTANCES)
+    assert walls.near_room(fit_of, room, SETTINGS_ROOM, False, lambda: DISTANCES).room == tuple(DISTANCES)
+    assert "what surrounds the object" in capfd.readouterr().err
+    found = walls.near_room(fit_of, room, SETTINGS_ROOM, True, lambda: np.where(np.arange(6) == 3, np.nan, DISTANCES)).room
+    np.testing.assert_allclose(found, DISTANCES, rtol=0.1)
 
 
 def test_what_is_given_stays():
