@@ -210,31 +210,31 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
             fit.cameras.begin([cameras[view.name] for view in shown.train])
         return fit
 
-    if settings.box is None and not any(view.masked for view in dataset.train):
-        box = BoundingBox.seen_by([view.camera for view in dataset.train], None if random else points.positions)
-        settings = _in_box(settings, box, dataset)
+    box = given = _box(settings, dataset)
+    if not any(view.masked for view in dataset.train):
+        box = given or BoundingBox.seen_by([view.camera for view in dataset.train], None if random else points.positions)
         if begin.foreground and points.normals is not None and settings.specular_start < 1:
-            alone = lambda points, settings: fit_from(
+            begun = lambda points, settings: fit_from(
                 _with_surroundings(points, dataset, settings).in_places(), placed, settings
             )
-            if found := foreground.found(alone, placed, points, settings, box, quiet):
-                points, settings = found[0], _in_box(settings, found[1], dataset)
-                opacity = begin.opacity or _HIDING
-    shown = points.positions
-    if settings.box is not None:
+            if found := foreground.found(begun, placed, points, _in_box(settings, box, dataset), box, quiet):
+                points, box, opacity = found[0], given or found[1], begin.opacity or _HIDING
+        if given is None:
+            settings = _in_box(settings, box, dataset)
+    beside = partial(_walls_seen, points.positions, box, scene.environment.rotation)
+    if box is not None:
         points = _with_surroundings(points, dataset, settings)
     fit_of = partial(fit_from, points.in_places())
     if settings.light == "auto":
         settings = light.tried(fit_of, dataset, settings, quiet)
     settings = light.ring_turns(fit_of, dataset, settings, quiet)
-
-    def around() -> np.ndarray:
-        box = _box(settings, dataset)
-        local = (shown - box.center) @ np.linalg.inv(scene.environment.rotation).T
-        return walls.surrounding(local, box.radius) / box.radius
-
-    settings = walls.near_room(fit_of, dataset, settings, quiet, None if settings.box is None else around)
+    settings = walls.near_room(fit_of, dataset, settings, quiet, None if box is None or random else beside)
     return fit_of(dataset, settings)
+
+
+def _walls_seen(positions, box, rotation) -> np.ndarray:
+    """Distances of the walls around what is in the ``box`` that points tell, in radii of it, in a frame of this ``rotation``."""
+    return walls.surrounding((positions - box.center) @ np.linalg.inv(rotation).T, box.radius) / box.radius
 
 
 def _in_box(settings, box, dataset):

@@ -13,6 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from scipy import ndimage
+from skimage.measure import label
 
 from ..core.bounding_box import BoundingBox
 from ..core.errors import UserError
@@ -28,10 +29,11 @@ from ..surfels.surfels import SH_0, SurfelColumns
 from .light import short
 from .trainer import Fit
 
+_STEPS = 200  # of the short fit
 _CLEAR_OF_GROUND = 0.03  # half edges of the box
 _HOLE = 0.02  # of a silhouette: what is smaller is none
 _OUTVOTED = 32  # in so many photographs one silhouette may be wrong at any point
-_ALIKE = 0.6  # of what hull or silhouette cover in a photograph both do, in the mean: less is no object
+_SOLID, _ALIKE = 0.9, 0.6  # coverage; of what hull or silhouettes cover by so much both do, in the mean: less is no object
 _POSITIONS, _NORMALS = 2, 5  # steps that a hull of such silhouettes is smoothed over, and its normals again
 _LEAST = 0.25  # of the points, at least, that start on the hull
 _MARGIN = 0.05  # of the box beside the hull, over its longest edge
@@ -52,7 +54,7 @@ def found(
     rng = np.random.default_rng((settings.seed, 3))
     below = ground(points.positions, points.normals, box, [view.camera for view in dataset.train], rng)
     with Progress(quiet=quiet, label="looking for the object") as progress:
-        fit = fit_of(points, replace(short(settings, settings.light), exposure="fixed", room=None, specular_start=1))
+        fit = fit_of(points, _trial(settings))
         while fit.progress < 1:
             fit.step()
             progress.update(0.8 * fit.progress)
@@ -61,19 +63,26 @@ def found(
         release_memory()
         progress.update(0.9)
         field = _hull(views)
-    if field is None:
-        told, result = "no object stands out in all photographs: surfels start where photographs agree", None
-    else:
-        part = float(np.mean([view.alpha.mean() for view in views]))
-        count = int(len(points.positions) * max(part, _LEAST))
-        stands = "" if below is None else ", above the ground"
-        told, result = (
-            f"photographs show an object{stands}: surfels start on its hull",
-            around_hull(points, dataset.train, field, _NORMALS, count, rng),
-        )
+        progress.update(1)
     if not quiet:
-        print(f"{told} (--set initialization.foreground=… changes it)", file=sys.stderr)
-    return result and (result, _box_of(field))
+        stands = "" if below is None else ", above the ground"
+        start = f"photographs show an object{stands}: surfels start on its hull"
+        nowhere = "no object stands out in all photographs: surfels start where photographs agree"
+        print(f"{start if field else nowhere} (--set initialization.foreground=… changes it)", file=sys.stderr)
+    if field is None:
+        return None
+    part = float(np.mean([view.alpha.mean() for view in views]))
+    count = int(len(points.positions) * max(part, _LEAST))
+    return around_hull(points, dataset.train, field, _NORMALS, count, rng), _box_of(field)
+
+
+def _trial(settings):
+    """The settings of the short fit, at half the resolution at which others begin: what its silhouettes are off by is smoothed
+    away, and half a minute of a finer one brings no more."""
+    coarse = short(settings, settings.light)
+    assert coarse.stages, "`short` gives one"
+    stage = replace(coarse.stages[0], downscale=2 * coarse.stages[0].downscale)
+    return replace(coarse, iterations=_STEPS, stages=(stage,), exposure="fixed", room=None, specular_start=1)
 
 
 def silhouettes(fit: Fit, box: BoundingBox, below: Plane | None) -> list[View]:
@@ -95,7 +104,7 @@ def silhouettes(fit: Fit, box: BoundingBox, below: Plane | None) -> list[View]:
 
 def _holes(inside):
     """Where a silhouette has a hole that is too small to be one."""
-    pieces, _ = ndimage.label(~inside)
+    pieces = np.asarray(label(~inside, connectivity=1))
     size = np.bincount(pieces.ravel())
     return (size < _HOLE * inside.sum())[pieces] & ~inside
 
@@ -122,7 +131,7 @@ def _hull(views) -> hull.SignedField | None:
         return None
     vertices, faces, _ = hull.surface(field)
     depths = hull.depth_maps(vertices, faces, [view.camera for view in views])
-    pairs = [(np.isfinite(depth), view.alpha > 0.5) for depth, view in zip(depths, views)]
+    pairs = [(np.isfinite(depth), view.alpha > _SOLID) for depth, view in zip(depths, views)]
     alike = np.mean([(one & other).sum() / max((one | other).sum(), 1) for one, other in pairs])
     return field if alike >= _ALIKE else None
 

@@ -249,8 +249,10 @@ def _field(silhouettes, box, resolution, outvoted=0):
 
 def largest_piece(field: SignedField) -> SignedField:
     """Return ``field`` with the largest of its connected pieces alone inside."""
-    pieces, count = ndimage.label(field.values > 0)
-    if count < 2:
+    from skimage.measure import label
+
+    pieces = np.asarray(label(field.values > 0, connectivity=1))
+    if pieces.max() < 2:
         return field
     largest = 1 + np.argmax(np.bincount(pieces.ravel())[1:])
     return replace(field, values=np.where((pieces > 0) & (pieces != largest), -field.step, field.values))

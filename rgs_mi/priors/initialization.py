@@ -116,13 +116,14 @@ def around_hull(
     node = (points.positions - field.lower) / field.step
     inside = ndimage.map_coordinates(field.values, node.T, order=1, mode="constant", cval=-np.inf) > -_BESIDE * field.step
     mesh = hull.surface(field, over)
-    return points.chosen(~inside).joined_with(_seen_on(mesh, *sample_surface(*mesh, count, rng), views))
+    positions, normals = sample_surface(*mesh, count, rng)
+    return points.chosen(~inside).joined_with(_seen_on(mesh, positions, normals, views))
 
 
 def _seen_on(mesh, positions, normals, views) -> Points:
     """Points on a hull's ``mesh``, or below it, as the ``views`` show them."""
-    spacing = spacing_of(positions)
-    depths = hull.depth_maps(*mesh[:2], [view.camera for view in views])
+    spacing, (vertices, faces, _) = spacing_of(positions), mesh
+    depths = hull.depth_maps(vertices, faces, [view.camera for view in views])
     reach = 2 * float(np.median(spacing))
     seen = lambda index, z, column, row: z < depths[index][row, column] + reach  # NaN: nothing is there
     return Points(positions, normals, spacing, appearance(positions, views, seen))

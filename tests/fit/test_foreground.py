@@ -13,7 +13,7 @@ from rgs_mi.core.bounding_box import BoundingBox
 from rgs_mi.core.camera import Camera
 from rgs_mi.datasets.path_traced import train_directions
 from rgs_mi.datasets.types import Dataset
-from rgs_mi.fit import foreground, light
+from rgs_mi.fit import foreground
 from rgs_mi.fit.model import Model
 from rgs_mi.fit.trainer import Fit
 from rgs_mi.priors.ground import Plane
@@ -29,7 +29,7 @@ from fits import SETTINGS, mirror_ball, photographs
 BALL, FLOOR, REACH = 5000, 60, 4.0  # surfels of the ball; along a side of the floor, and half of that side
 GROUND = -1.2
 BOX = BoundingBox((-1.6, -1.6, -1.4), (1.6, 1.6, 1.6))
-SETTINGS_FOUND = replace(SETTINGS, stages=(Stage(1.0, 2, 1),), light="world", box=BOX.corners)
+SETTINGS_FOUND = replace(SETTINGS, stages=(Stage(1.0, 1, 1),), light="world", box=BOX.corners)
 DOWN = Plane(np.array([0.0, 0.0, 1.0]), GROUND)
 
 
@@ -101,7 +101,7 @@ def start(dataset):
 
 
 def test_a_mirror_ball_on_a_floor_is_found(monkeypatch, capture, capfd):
-    monkeypatch.setattr(light, "_STEPS", 200)
+    monkeypatch.setattr(foreground, "_STEPS", 100)
     given = points()
     found = foreground.found(start(capture), capture, given, SETTINGS_FOUND, BOX, quiet=False)
     assert found is not None and "above the ground" in capfd.readouterr().err
@@ -132,7 +132,7 @@ def test_silhouettes_are_those_of_what_is_above_the_ground(capture):
 
 
 def test_a_floor_alone_is_no_object(monkeypatch, capfd):
-    monkeypatch.setattr(light, "_STEPS", 30)
+    monkeypatch.setattr(foreground, "_STEPS", 20)
     surfels = scene(ball=False)
     cameras = [Camera.look_at(5 * d, (0, 0, 0), (0, 0, 1), 40, (64, 64)) for d in train_directions(20) if d[2] > 0.2]
     lamps = Environment(dr.full(mi.TensorXf, 0.1, (16, 32, 3)), np.eye(3))
