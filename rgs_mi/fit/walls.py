@@ -48,7 +48,7 @@ _SHARP, _LEAST_ALBEDO, _WHITE, _OPAQUE = 0.25, 0.1, 0.99, 0.98  # of what counts
 _EPSILON, _FEWEST = 0.05, 3  # ε, and the pixels of a texel that counts
 _FACTORS = 1.5, 1.2, 1.1, 1.05  # from one distance to the next, finer and finer
 _ALL = 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0  # radii of the object, of all walls at first
-_BOUNDS = 1.0, 32.0  # the least and the largest, of a wall the object stands on half as much
+_BOUNDS = 0.5, 32.0  # the least and the largest
 _BEYOND, _CELLS = (
     1.2,
     24,
@@ -59,12 +59,14 @@ _CLEAR = 0.95  # of the variance of light at infinity that walls may have
 @dataclass(frozen=True)
 class Reflections:
     """What pixels show of the environment: ``log_radiance`` and ``weight`` are y and w of (28); ``direction`` and ``q`` those
-    of (14)."""
+    of (14). ``reach`` [6] is how far cameras stand from the center towards each wall (`SIDES`), in world units: they are among
+    them."""
 
     direction: "mi.Vector3f"
     q: "mi.Vector3f"
     log_radiance: "mi.Color3f"
     weight: "mi.Float"
+    reach: np.ndarray
 
     @classmethod
     def seen_by(cls, fit: Fit) -> "Reflections":
@@ -76,8 +78,11 @@ class Reflections:
             lighting = fit.lighting(surfels)
             assert lighting is not None, "something is specular"
             found = [_shown(fit, surfels, lighting, photographs.tile(k)) for k in range(len(fit.dataset.train))]
-        direction, q, light, weight = (np.ascontiguousarray(np.concatenate(parts, -1), np.float32) for parts in zip(*found))
-        return cls(mi.Vector3f(direction), mi.Vector3f(q), mi.Color3f(np.log(_EPSILON + light)), mi.Float(weight))
+        direction, q, light, weight, eye = (
+            np.ascontiguousarray(np.concatenate(parts, -1), np.float32) for parts in zip(*found)
+        )
+        reach = np.maximum(np.stack([-eye.min(1), eye.max(1)], 1).ravel(), 0)
+        return cls(mi.Vector3f(direction), mi.Vector3f(q), mi.Color3f(np.log(_EPSILON + light)), mi.Float(weight), reach)
 
     def __len__(self) -> int:
         return dr.width(self.weight)
@@ -107,7 +112,7 @@ class Reflections:
 
 
 def _shown(fit, surfels, lighting, photograph):
-    """Of one photograph ω [3, n] and q [3, n] of (14), L [3, n] and w [n]."""
+    """Of one photograph ω [3, n] and q [3, n] of (14), L [3, n] and w [n], and where its camera is [3, 1], as q."""
     camera = photograph.camera
     image = deferred.render(surfels, camera, lighting)
     inside = deferred.within(image.gbuffer, camera, lighting.box) & (image.gbuffer.all.alpha > _OPAQUE)
@@ -117,29 +122,32 @@ def _shown(fit, surfels, lighting, photograph):
     specular = dr.opaque(mi.Float, specular_of(fit.shading.eta))
     E, _ = albedo(surface.cosine, surface.roughness, surface.metallic, surface.base_color, specular)
     direction = environment.to_local(2 * surface.cosine * surface.normal - surface.view)
-    q = environment.to_local(surface.point - mi.Point3f(*map(float, fit.model.center)))
+    center = mi.Point3f(*map(float, fit.model.center))
+    q, eye = (environment.to_local(point - center) for point in (surface.point, mi.Point3f(*map(float, camera.origin))))
     at = lambda image: np.array(dr.gather(mi.Color3f, image, index))
     E, weight = np.array(E), np.array(dr.mean(E))
     light = (srgb_decode(at(photograph.color)) - at(image.diffuse)) / np.maximum(E, _EPSILON)
     counts = (np.array(surface.roughness) < _SHARP) & (weight > _LEAST_ALBEDO)
-    return [a[..., counts] for a in (np.array(direction), np.array(q), np.maximum(light, 0), weight)]
+    shown = [a[..., counts] for a in (np.array(direction), np.array(q), np.maximum(light, 0), weight)]
+    return [*shown, np.array(eye).reshape(3, 1)]
 
 
 def nearest(reflections: Reflections, extent: float, known: np.ndarray | None = None) -> tuple[np.ndarray, float]:
     """Return (distances [6], part): of the walls (`SIDES`), in world units, that have the least variance (28), and what part of
     that of light at infinity it is. ``extent`` is the object's radius; ``known`` distances [6] stay (NaN: is looked for). All at
-    once, then each by itself, closer and closer."""
+    once, then each by itself, closer and closer, but no closer than cameras stand."""
     known = np.full(len(SIDES), np.nan) if known is None else known
     far = reflections.variance(np.full(len(SIDES), np.inf))
     free = np.flatnonzero(np.isnan(known))
-    tried = [np.where(np.isnan(known), d * extent, known) for d in _ALL]
-    distances, least = _closer(reflections.variance, min(tried, key=reflections.variance), free, extent)
+    tried = [np.where(np.isnan(known), np.maximum(d * extent, reflections.reach), known) for d in _ALL]
+    start = min(tried, key=reflections.variance)
+    distances, least = _closer(reflections.variance, start, free, np.maximum(_BOUNDS[0] * extent, reflections.reach), extent)
     return distances, least / far
 
 
-def _closer(cost, distances, sides, extent):
+def _closer(cost, distances, sides, nearest, extent):
     """(distances [6], cost) of the least ``cost`` that a pattern search (Hooke and Jeeves 1961) finds from ``distances`` on,
-    moving the walls ``sides``."""
+    moving the walls ``sides``, no nearer than ``nearest`` [6]."""
     least = cost(distances)
     for factor in _FACTORS:
         moved = True
@@ -149,7 +157,7 @@ def _closer(cost, distances, sides, extent):
                 for times in (factor, 1 / factor):
                     other = distances.copy()
                     other[side] *= times
-                    if _BOUNDS[0] / 2 <= other[side] / extent <= _BOUNDS[1] and (v := cost(other)) < least:
+                    if nearest[side] <= other[side] <= _BOUNDS[1] * extent and (v := cost(other)) < least:
                         distances, least, moved = other, v, True
     return distances, least
 
@@ -172,7 +180,7 @@ def surrounding(points: np.ndarray, extent: float) -> np.ndarray:
     across = np.maximum(np.abs(along), 1e-9)
     cost = lambda d: float(np.abs(logs - np.log((d[ahead] / across).min(1))).mean())
     starts = [np.full(len(SIDES), d * extent) for d in _ALL]
-    distances, _ = _closer(cost, min(starts, key=cost), range(len(SIDES)), extent)
+    distances, _ = _closer(cost, min(starts, key=cost), range(len(SIDES)), np.full(len(SIDES), _BOUNDS[0] * extent), extent)
     met = ahead[np.arange(len(group)), (distances[ahead] / across).argmin(1)]
     return np.where(np.bincount(met, minlength=len(SIDES)) >= _FEWEST, distances, np.nan)
 

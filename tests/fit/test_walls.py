@@ -21,7 +21,7 @@ from rgs_mi.shading.room import Room
 
 from fits import SETTINGS, mirror_ball, photographs
 
-DISTANCES = np.array([3.0, 4.0, 1.2, 3.5, 2.5, 5.0])
+DISTANCES = np.array([3.0, 4.0, 2.4, 3.5, 2.6, 5.0])
 FAR = np.full(6, np.inf)
 BALL = 3000  # surfels
 SETTINGS_ROOM = replace(SETTINGS, stages=(Stage(1.0, 1, 1),), specular_start=0.0, light="world", room="auto")
@@ -48,7 +48,9 @@ def reflections(distances, n=20000):
         np.int32(np.arctan2(spot[:, 0], -spot[:, 2]) / (2 * np.pi) % 1 * 2 * rows - 1e-3),
     ]
     weight = np.float32(rng.uniform(0.2, 1, n))
-    return walls.Reflections(vector(direction), vector(q), mi.Color3f(np.ascontiguousarray(y.T)), mi.Float(weight))
+    return walls.Reflections(
+        vector(direction), vector(q), mi.Color3f(np.ascontiguousarray(y.T)), mi.Float(weight), np.zeros(6)
+    )
 
 
 def test_the_variance_is_that_of_a_slow_twin():
@@ -76,6 +78,17 @@ def test_the_walls_that_make_reflections_alike_are_found():
     distances, part = walls.nearest(reflections(DISTANCES), 1.0)
     assert np.abs(distances / DISTANCES - 1).max() < 0.1
     assert part < 0.5
+
+
+def test_cameras_stand_among_the_walls():
+    beyond = np.where(np.arange(6) == 3, 4.5, 0.0)  # where the wall stands at 3.5
+    distances, _ = walls.nearest(replace(reflections(DISTANCES), reach=beyond), 1.0)
+    assert distances[3] == pytest.approx(4.5, rel=0.05) and distances[3] >= 4.5
+    fit = fit_of(capture(DISTANCES), replace(light.short(SETTINGS_ROOM, "world"), room=None))
+    x, y, z = np.array([view.camera.origin for view in fit.dataset.train]).T
+    np.testing.assert_allclose(
+        walls.Reflections.seen_by(fit).reach, np.maximum([-min(x), max(x), -min(y), max(y), -min(z), max(z)], 0), rtol=1e-5
+    )
 
 
 def test_light_at_infinity_has_no_walls():
@@ -118,7 +131,7 @@ def capture(distances):
     room = Room((0.0, 0.0, 0.0), mi.Float([float(1 / d) for d in distances]))
     lamps = Environment(mi.TensorXf(np.exp(painting()) / 3), np.eye(3), room=room)
     ball = mirror_ball(BALL)
-    cameras = [Camera.look_at(4 * d, (0, 0, 0), (0, 0, 1), 40, (96, 96)) for d in train_directions(40)]
+    cameras = [Camera.look_at(2.3 * d, (0, 0, 0), (0, 0, 1), 60, (96, 96)) for d in train_directions(40)]
     return Dataset(photographs(ball, lighting_of(Shading(), ball, lamps.filtered()), cameras), [])
 
 
