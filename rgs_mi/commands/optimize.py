@@ -221,7 +221,8 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
                 points, box, opacity = found[0], given or found[1], begin.opacity or _HIDING
         if given is None:
             settings = _in_box(settings, box, dataset)
-    beside = partial(_walls_seen, points.positions, box, scene.environment.rotation)
+    eyes = np.array([camera.origin for camera in cameras.values()])
+    beside = partial(_walls_seen, points.positions, eyes, box, scene.environment.rotation)
     if box is not None:
         points = _with_surroundings(points, dataset, settings)
     fit_of = partial(fit_from, points.in_places())
@@ -232,9 +233,11 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
     return fit_of(dataset, settings)
 
 
-def _walls_seen(positions, box, rotation) -> np.ndarray:
-    """Distances of the walls around what is in the ``box`` that points tell, in radii of it, in a frame of this ``rotation``."""
-    return walls.surrounding((positions - box.center) @ np.linalg.inv(rotation).T, box.radius) / box.radius
+def _walls_seen(positions, eyes, box, rotation) -> np.ndarray:
+    """Distances of the walls around what is in the ``box`` that points tell, and cameras at ``eyes``, in radii of it, in a frame
+    of this ``rotation``."""
+    points, eyes = ((of - box.center) @ np.linalg.inv(rotation).T for of in (positions, eyes))
+    return walls.surrounding(points, box.radius, eyes) / box.radius
 
 
 def _in_box(settings, box, dataset):

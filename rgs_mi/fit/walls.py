@@ -53,6 +53,7 @@ _BEYOND, _CELLS = (
     1.2,
     24,
 )  # radii of the object from which on points are surroundings; cells along a side of a cube of directions
+_AGREE = 0.1  # of the distance, that a spot of a wall is off it at most
 _CLEAR = 0.95  # of the variance of light at infinity that walls may have
 
 
@@ -81,8 +82,8 @@ class Reflections:
         direction, q, light, weight, eye = (
             np.ascontiguousarray(np.concatenate(parts, -1), np.float32) for parts in zip(*found)
         )
-        reach = np.maximum(np.stack([-eye.min(1), eye.max(1)], 1).ravel(), 0)
-        return cls(mi.Vector3f(direction), mi.Vector3f(q), mi.Color3f(np.log(_EPSILON + light)), mi.Float(weight), reach)
+        log_radiance = mi.Color3f(np.log(_EPSILON + light))
+        return cls(mi.Vector3f(direction), mi.Vector3f(q), log_radiance, mi.Float(weight), _reach(eye))
 
     def __len__(self) -> int:
         return dr.width(self.weight)
@@ -162,10 +163,15 @@ def _closer(cost, distances, sides, nearest, extent):
     return distances, least
 
 
-def surrounding(points: np.ndarray, extent: float) -> np.ndarray:
+def _reach(eyes):
+    """How far cameras at ``eyes`` [3, M] stand from the center towards each wall (`SIDES`), [6]."""
+    return np.maximum(np.stack([-eyes.min(1), eyes.max(1)], 1).ravel(), 0)
+
+
+def surrounding(points: np.ndarray, extent: float, eyes: np.ndarray) -> np.ndarray:
     """Return the distances [6] of the walls (`SIDES`) that ``points`` [N, 3] of the surroundings tell by (29), in the units of
-    both, NaN where they do not. Points are relative to the middle of the object, whose radius is ``extent``, in the environment's
-    frame; what lies closer to the object is no wall."""
+    all, NaN where they do not. Points, and cameras, which stand among the walls, at ``eyes`` [M, 3], are relative to the middle
+    of the object, whose radius is ``extent``, in the environment's frame; what lies closer to the object is no wall."""
     radius = np.linalg.norm(points, axis=1)
     points, radius = points[radius > _BEYOND * extent], radius[radius > _BEYOND * extent]
     direction = points / radius[:, None]
@@ -180,8 +186,12 @@ def surrounding(points: np.ndarray, extent: float) -> np.ndarray:
     across = np.maximum(np.abs(along), 1e-9)
     cost = lambda d: float(np.abs(logs - np.log((d[ahead] / across).min(1))).mean())
     starts = [np.full(len(SIDES), d * extent) for d in _ALL]
-    distances, _ = _closer(cost, min(starts, key=cost), range(len(SIDES)), np.full(len(SIDES), _BOUNDS[0] * extent), extent)
-    met = ahead[np.arange(len(group)), (distances[ahead] / across).argmin(1)]
+    least = np.maximum(_reach(eyes.T), _BOUNDS[0] * extent)
+    starts = [np.maximum(start, least) for start in starts]
+    distances, _ = _closer(cost, min(starts, key=cost), range(len(SIDES)), least, extent)
+    there = distances[ahead] / across
+    agree = np.abs(logs - np.log(there.min(1))) < _AGREE
+    met = ahead[agree, there.argmin(1)[agree]]
     return np.where(np.bincount(met, minlength=len(SIDES)) >= _FEWEST, distances, np.nan)
 
 

@@ -23,6 +23,7 @@ from fits import SETTINGS, mirror_ball, photographs
 
 DISTANCES = np.array([3.0, 4.0, 2.4, 3.5, 2.6, 5.0])
 FAR = np.full(6, np.inf)
+EYES = 2.3 * np.concatenate([np.eye(3), -np.eye(3)])  # where cameras stand
 BALL = 3000  # surfels
 SETTINGS_ROOM = replace(SETTINGS, stages=(Stage(1.0, 1, 1),), specular_start=0.0, light="world", room="auto")
 
@@ -107,16 +108,22 @@ def spots(distances, sides=range(6), n=4000):
 
 
 def test_walls_that_photographs_show_are_found():
-    np.testing.assert_allclose(walls.surrounding(spots(DISTANCES), 1.0), DISTANCES, rtol=0.05)
-    np.testing.assert_allclose(walls.surrounding(100 * spots(DISTANCES), 100.0), 100 * DISTANCES, rtol=0.05)
+    np.testing.assert_allclose(walls.surrounding(spots(DISTANCES), 1.0, EYES), DISTANCES, rtol=0.05)
+    np.testing.assert_allclose(walls.surrounding(100 * spots(DISTANCES), 100.0, EYES), 100 * DISTANCES, rtol=0.05)
 
 
 def test_a_wall_that_no_photograph_shows_stays_unknown():
-    found = walls.surrounding(spots(DISTANCES, sides=(0, 1, 2, 4, 5)), 1.0)
+    found = walls.surrounding(spots(DISTANCES, sides=(0, 1, 2, 4, 5)), 1.0, EYES)
     assert np.isnan(found).tolist() == [False, False, False, True, False, False]
     np.testing.assert_allclose(np.delete(found, 3), np.delete(DISTANCES, 3), rtol=0.05)
-    assert np.isnan(walls.surrounding(np.zeros((0, 3)), 1.0)).all()
-    assert np.isnan(walls.surrounding(spots(DISTANCES)[-50:], 1.0)).all()  # the object alone
+    assert np.isnan(walls.surrounding(np.zeros((0, 3)), 1.0, EYES)).all()
+    assert np.isnan(walls.surrounding(spots(DISTANCES)[-50:], 1.0, EYES)).all()  # the object alone
+
+
+def test_what_hangs_lower_than_a_camera_stands_is_no_ceiling():
+    hanging = spots(np.where(np.arange(6) == 3, 1.3, DISTANCES))
+    found = walls.surrounding(hanging, 1.0, EYES)
+    assert np.isnan(found).tolist() == [False, False, False, True, False, False]
 
 
 def test_mirrors_tell_the_wall_that_is_not_known():
