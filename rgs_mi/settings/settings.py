@@ -62,9 +62,9 @@ class Initialization:
         "the hull.",
     )
     foreground: bool = Field(
-        default=True,
+        default=False,
         description="Where photographs have no masks, a short fit tells what they show of an object, above the ground; surfels "
-        "start on the visual hull of that.",
+        "start on the visual hull of that. For mirrors, which have no depth that photographs agree on.",
     )
     silhouettes: bool = Field(
         default=True,
