@@ -202,7 +202,8 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
             points.appearance.metallic,
             settings.shader,
             two_sided=None if box is None else True,
-            room=None if settings.room is None else (center, np.multiply(settings.room, extent)),
+            center=center,
+            room=None if settings.room is None else np.multiply(settings.room, extent),
             specular=specular if learns_specular else None,
         )
         fit = Fit(shown, model, settings, extent, shading, _priors(shown, settings))

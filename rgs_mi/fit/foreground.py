@@ -22,7 +22,7 @@ from ..core.runtime import release_memory
 from ..datasets.types import Dataset, View
 from ..priors import hull
 from ..priors.ground import Plane, ground
-from ..priors.initialization import Points, around_hull
+from ..priors.initialization import A_WRONG_MASK, Points, around_hull
 from ..settings.settings import Settings
 from ..shading import deferred
 from ..surfels.surfels import SH_0, SurfelColumns
@@ -32,7 +32,6 @@ from .trainer import Fit
 _STEPS = 200  # of the short fit
 _CLEAR_OF_GROUND = 0.03  # half edges of the box
 _HOLE = 0.02  # of a silhouette: what is smaller is none
-_OUTVOTED = 32  # in so many photographs one silhouette may be wrong at any point
 _SOLID, _ALIKE = 0.9, 0.6  # coverage; of what hull or silhouettes cover by so much both do, in the mean: less is no object
 _POSITIONS, _NORMALS = 2, 5  # steps that a hull of such silhouettes is smoothed over, and its normals again
 _LEAST = 0.25  # of the points, at least, that start on the hull
@@ -123,7 +122,7 @@ def _marked(fit, box, below) -> SurfelColumns:
 def _hull(views) -> hull.SignedField | None:
     """The largest piece of the visual hull of ``views``; None where these have none, or another object each."""
     try:
-        field = hull.visual_hull(views, outvoted=len(views) // _OUTVOTED)
+        field = hull.visual_hull(views, outvoted=len(views) // A_WRONG_MASK)
         field = hull.largest_piece(replace(field, values=ndimage.gaussian_filter(field.values, _POSITIONS)))
     except UserError:
         return None

@@ -92,7 +92,8 @@ class Model:
         metallic: np.ndarray | float = 0.4,
         shader: str = "identity",
         two_sided: bool | None = None,
-        room: tuple[np.ndarray | Sequence[float], npt.ArrayLike] | None = None,
+        center: np.ndarray | Sequence[float] = (0, 0, 0),
+        room: npt.ArrayLike | None = None,
         specular: float | None = None,
     ) -> "Model":
         """Make the model that a fit starts with.
@@ -107,7 +108,8 @@ class Model:
           opacity, roughness, metallic: of all surfels; metallic may be [N], of each
           shader:      'identity' or 'mlp', as in `Settings`
           two_sided:   see `Surfels` (None: where normals are random; others point outwards)
-          room:        center, and distance of all walls or of each, on which the environment is painted (None: it is at infinity)
+          center:      [3] where walls are seen from, world space
+          room:        distance of all walls or of each, on which the environment is painted (None: it is at infinity)
           specular:    (22) of `shading/tables.py`, which is learned (None: it is given)
         """
         from ..surfels.surfels import rotation_from_normal
@@ -134,12 +136,12 @@ class Model:
                 "curvature": np.zeros((n, 3)),
                 ENVIRONMENT: np.log(np.maximum(environment, 1e-3)),
                 **({SHADER: initial_weights(seed)} if shader == "mlp" else {}),
-                **({ROOM: np.broadcast_to(-np.log(room[1]), len(SIDES)).copy()} if room else {}),
+                **({} if room is None else {ROOM: np.broadcast_to(-np.log(room), len(SIDES)).copy()}),
                 **({} if specular is None else {SPECULAR: np.full(1, logit(specular))}),
             },
             rotation,
             two_sided,
-            room[0] if room else (0, 0, 0),
+            center,
         )
 
     def __len__(self) -> int:

@@ -45,14 +45,13 @@ from .trainer import Fit
 _ROUNDS = 2  # short fits, the first to light at infinity
 _ROWS, _A_TEXEL = (16, 64), 20  # rows, at least and at most, of the map whose texels are compared; pixels in one of them
 _SHARP, _LEAST_ALBEDO, _WHITE, _OPAQUE = 0.25, 0.1, 0.99, 0.98  # of what counts: rougher, darker, whiter is left out
+_ENOUGH = _A_TEXEL * 2 * _ROWS[0] ** 2  # pixels that show reflections, to tell walls
 _EPSILON, _FEWEST = 0.05, 3  # ε, and the pixels of a texel that counts
 _FACTORS = 1.5, 1.2, 1.1, 1.05  # from one distance to the next, finer and finer
 _ALL = 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 16.0  # radii of the object, of all walls at first
 _BOUNDS = 0.5, 32.0  # the least and the largest
-_BEYOND, _CELLS = (
-    1.2,
-    24,
-)  # radii of the object from which on points are surroundings; cells along a side of a cube of directions
+_BEYOND = 1.2  # radii of the object from which on points are surroundings
+_CELLS = 24  # of directions, along a side of a cube
 _AGREE = 0.1  # of the distance, that a spot of a wall is off it at most
 _CLEAR = 0.95  # of the variance of light at infinity that walls may have
 
@@ -139,26 +138,25 @@ def nearest(reflections: Reflections, extent: float, known: np.ndarray | None = 
     once, then each by itself, closer and closer, but no closer than cameras stand."""
     known = np.full(len(SIDES), np.nan) if known is None else known
     far = reflections.variance(np.full(len(SIDES), np.inf))
-    free = np.flatnonzero(np.isnan(known))
-    tried = [np.where(np.isnan(known), np.maximum(d * extent, reflections.reach), known) for d in _ALL]
-    start = min(tried, key=reflections.variance)
-    distances, least = _closer(reflections.variance, start, free, np.maximum(_BOUNDS[0] * extent, reflections.reach), extent)
+    distances, least = _searched(reflections.variance, known, reflections.reach, extent)
     return distances, least / far
 
 
-def _closer(cost, distances, sides, nearest, extent):
-    """(distances [6], cost) of the least ``cost`` that a pattern search (Hooke and Jeeves 1961) finds from ``distances`` on,
-    moving the walls ``sides``, no nearer than ``nearest`` [6]."""
+def _searched(cost, known, reach, extent):
+    """(distances [6], cost) of the least ``cost`` that a pattern search (Hooke and Jeeves 1961) finds, from all walls at one
+    distance on, but for those that are ``known``, and no nearer than cameras ``reach`` [6]."""
+    lower, free = np.maximum(reach, _BOUNDS[0] * extent), np.isnan(known)
+    distances = min((np.where(free, np.maximum(d * extent, lower), known) for d in _ALL), key=cost)
     least = cost(distances)
     for factor in _FACTORS:
         moved = True
         while moved:
             moved = False
-            for side in sides:
+            for side in np.flatnonzero(free):
                 for times in (factor, 1 / factor):
                     other = distances.copy()
                     other[side] *= times
-                    if nearest[side] <= other[side] <= _BOUNDS[1] * extent and (v := cost(other)) < least:
+                    if lower[side] <= other[side] <= _BOUNDS[1] * extent and (v := cost(other)) < least:
                         distances, least, moved = other, v, True
     return distances, least
 
@@ -185,10 +183,7 @@ def surrounding(points: np.ndarray, extent: float, eyes: np.ndarray) -> np.ndarr
     ahead = 2 * np.arange(3) + (along > 0)  # [cells, 3] the wall along each axis
     across = np.maximum(np.abs(along), 1e-9)
     cost = lambda d: float(np.abs(logs - np.log((d[ahead] / across).min(1))).mean())
-    starts = [np.full(len(SIDES), d * extent) for d in _ALL]
-    least = np.maximum(_reach(eyes.T), _BOUNDS[0] * extent)
-    starts = [np.maximum(start, least) for start in starts]
-    distances, _ = _closer(cost, min(starts, key=cost), range(len(SIDES)), least, extent)
+    distances, _ = _searched(cost, np.full(len(SIDES), np.nan), _reach(eyes.T), extent)
     there = distances[ahead] / across
     agree = np.abs(logs - np.log(there.min(1))) < _AGREE
     met = ahead[agree, there.argmin(1)[agree]]
@@ -217,7 +212,7 @@ def near_room(
     if np.isnan(known).all():
         walls, found = _mirrored(fit_of, dataset, settings, quiet)
     else:
-        walls, found = _completed(fit_of, dataset, settings, known, quiet), "what surrounds the object is near"
+        walls, found = _completed(fit_of, dataset, settings, known, quiet), "photographs show what surrounds the object"
     listing = ", ".join(f"{side} {d:.1f}" for side, d in zip(SIDES, walls or ()))
     chosen = f"a room, walls at {listing} radii of the object" if walls else "light at infinity"
     if not quiet:
@@ -232,7 +227,7 @@ def _mirrored(fit_of, dataset, settings, quiet):
         for k in range(_ROUNDS):
             done = lambda part, k=k: progress.update((k + part) / _ROUNDS)
             reflections, extent = _reflections(fit_of, dataset, settings, walls, done)
-            if len(reflections) < _A_TEXEL * 2 * _ROWS[0] ** 2:
+            if len(reflections) < _ENOUGH:
                 break
             distances, part = nearest(reflections, extent)
             walls = tuple(float(d) for d in distances / extent)
@@ -248,7 +243,7 @@ def _completed(fit_of, dataset, settings, known, quiet):
     if np.isnan(known).any():
         with Progress(quiet=quiet, label="walls of the room") as progress:
             reflections, extent = _reflections(fit_of, dataset, settings, tuple(map(float, walls)), progress.update)
-            if len(reflections) >= _A_TEXEL * 2 * _ROWS[0] ** 2:
+            if len(reflections) >= _ENOUGH:
                 walls = nearest(reflections, extent, known * extent)[0] / extent
     return tuple(map(float, walls))
 

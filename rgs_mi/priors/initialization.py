@@ -17,7 +17,7 @@ from .surface_points import oriented_points
 
 _FAR = 10
 _DEEPER = 2  # area of what lies below the hull, over that of the hull that is seen through
-_A_WRONG_MASK = 32  # in so many photographs one mask may be wrong at any point
+A_WRONG_MASK = 32  # in so many photographs one mask may be wrong at any point
 _COMPARED = 120  # photographs at most that are compared: more say little more, and half a second goes into each
 _BESIDE = 1.5  # steps of the hull's grid that a point lies off it at least, which counts as beside it
 _FEW = 0.1  # of the points that are wanted: fewer that photographs agree on are no start
@@ -67,7 +67,7 @@ def initial_points(
     rng, views = np.random.default_rng(seed), dataset.train
     if any(view.masked for view in views):
         if on_hull:
-            return _on_hull(views, count, rng, compare, len(views) // _A_WRONG_MASK if dataset.photographed else 0, quiet)
+            return _on_hull(views, count, rng, compare, len(views) // A_WRONG_MASK if dataset.photographed else 0, quiet)
     elif compare:
         compared = _spread(views)
         maps = stereo.verified(stereo.depth_maps(compared, quiet=quiet))
@@ -122,7 +122,8 @@ def around_hull(
 
 def _seen_on(mesh, positions, normals, views) -> Points:
     """Points on a hull's ``mesh``, or below it, as the ``views`` show them."""
-    spacing, (vertices, faces, _) = spacing_of(positions), mesh
+    spacing = spacing_of(positions)
+    vertices, faces, _ = mesh
     depths = hull.depth_maps(vertices, faces, [view.camera for view in views])
     reach = 2 * float(np.median(spacing))
     seen = lambda index, z, column, row: z < depths[index][row, column] + reach  # NaN: nothing is there

@@ -24,8 +24,9 @@ Rates = tuple[Annotated[float, Field(ge=0, le=10)], Annotated[float, Field(ge=0,
 Fraction = Annotated[float, Field(ge=0, le=1)]
 #: From which to which part of the fit.
 Period = Annotated[tuple[Fraction, Fraction], AfterValidator(_in_order)]
-#: A weight at the beginning and at the end, joined geometrically.
+#: How far a wall of a room is, in radii of the object.
 Wall = Annotated[float, Field(gt=0, le=1e6)]
+#: A weight at the beginning and at the end, joined geometrically.
 WeightPair = tuple[Annotated[float, Field(ge=0, le=1e3)], Annotated[float, Field(ge=0, le=1e3)]]
 
 
@@ -344,8 +345,9 @@ class Settings:
     room: Literal["auto"] | Wall | tuple[Wall, Wall, Wall, Wall, Wall, Wall] | None = Field(
         default=None,
         description="The light is painted on the walls of a room, at first so many radii of the object from its middle: one "
-        "number, one for each wall (-x, +x, -y, +y, -z, +z of the environment's frame), or what two short fits tell, if they do "
-        "(auto). From `refine_start` on they are learned. Unless given, the light is at infinity.",
+        "number, one for each wall (-x, +x, -y, +y, -z, +z of the environment's frame), or (auto) what photographs without masks "
+        "show of them, else what two short fits tell, if they do. From `refine_start` on they are learned. Unless given, the "
+        "light is at infinity.",
     )
     cameras: Literal["fixed", "learned"] = Field(
         default="fixed",

@@ -81,12 +81,13 @@ def test_the_walls_that_make_reflections_alike_are_found():
     assert part < 0.5
 
 
-def test_cameras_stand_among_the_walls():
+@pytest.mark.parametrize("center", [(0.0, 0.0, 0.0), (0.3, -0.2, 0.1)])
+def test_cameras_stand_among_the_walls(center):
     beyond = np.where(np.arange(6) == 3, 4.5, 0.0)  # where the wall stands at 3.5
     distances, _ = walls.nearest(replace(reflections(DISTANCES), reach=beyond), 1.0)
     assert distances[3] == pytest.approx(4.5, rel=0.05) and distances[3] >= 4.5
-    fit = fit_of(capture(DISTANCES), replace(light.short(SETTINGS_ROOM, "world"), room=None))
-    x, y, z = np.array([view.camera.origin for view in fit.dataset.train]).T
+    fit = fit_of(capture(DISTANCES), replace(light.short(SETTINGS_ROOM, "world"), room=None), center)
+    x, y, z = np.array([view.camera.origin - center for view in fit.dataset.train]).T
     np.testing.assert_allclose(
         walls.Reflections.seen_by(fit).reach, np.maximum([-min(x), max(x), -min(y), max(y), -min(z), max(z)], 0), rtol=1e-5
     )
@@ -142,12 +143,12 @@ def capture(distances):
     return Dataset(photographs(ball, lighting_of(Shading(), ball, lamps.filtered()), cameras), [])
 
 
-def fit_of(dataset, settings):
-    """A fit that starts on the ball, of another material."""
+def fit_of(dataset, settings, center=(0.0, 0.0, 0.0)):
+    """A fit that starts on the ball, of another material, in a room that is seen from its ``center``."""
     ball = mirror_ball(BALL).numpy()
-    x, room = ball["centers"], None if settings.room is None else ((0.0, 0.0, 0.0), settings.room)
+    x = ball["centers"]
     diffuse, spacing, environment = np.full((BALL, 3), 0.1), np.full(BALL, 0.1), np.full((32, 64, 3), 0.5)
-    options = {"metallic": 0.8, "roughness": 0.2, "opacity": 0.98, "room": room}
+    options = {"metallic": 0.8, "roughness": 0.2, "opacity": 0.98, "room": settings.room, "center": center}
     model = Model.start(x, x, diffuse, spacing, environment, np.eye(3), 1, **options)
     for name, value in {"log_scales": np.log(ball["scales"]), "curvature": ball["curvature"]}.items():
         model.set(name, value)
