@@ -13,18 +13,21 @@ _REACH = 8  # pixels to either side of the masks' borders that are looked at
 _VIEWS = 16  # that tell as much as all
 _SIGMA = 0.8  # pixels, of derivatives
 _HALF = 0.25  # pixels: with it what is left has, over all directions, the area of what had been grown by whole ones
+_LEAST = 1.0  # pixels: within exact borders, too, edges are seen by up to 0.6, where the object changes towards them
 _CLEAR = 2.0  # times as strong as beside the object must an edge be
 
 
 def rim(views: Sequence[View]) -> int:
     """Return how many pixels the masks of ``views`` are too large by: how far within their borders photographs change most
-    from what lies behind to the object, in the mean over views; 0 where there are no masks, or where photographs do not
-    tell, as those with much detail behind the object."""
+    from what lies behind to the object, in the mean over views; 0 where there are no masks, where it is less than a pixel, which
+    exact masks may seem to have, and where photographs do not tell, as those with much detail behind the object."""
     masked = [view for view in views if view.masked]
     profiles = [profile for view in masked[:: -(-len(masked) // _VIEWS) or 1] if (profile := _profile(view)) is not None]
-    if not profiles:
-        return 0
-    change = np.mean(profiles, 0)
+    return _width(np.mean(profiles, 0)) if profiles else 0
+
+
+def _width(change):
+    """The width of a rim in whole pixels, by `_profile`."""
     beside = np.median(change[: _REACH // 2])
     peaks = [
         k
@@ -35,7 +38,8 @@ def rim(views: Sequence[View]) -> int:
         return 0
     before, at, after = change[peaks[0] - 1 : peaks[0] + 2]
     vertex = 0.5 * (before - after) / (before - 2 * at + after)
-    return max(round(peaks[0] + vertex - _REACH + 0.5), 0)
+    within = peaks[0] + vertex - _REACH + 0.5
+    return round(within) if within >= _LEAST else 0
 
 
 def without_rim(view: View, pixels: int | None) -> View:

@@ -22,7 +22,7 @@ from ..core.runtime import release_memory
 from ..datasets.types import Dataset, View
 from ..priors import hull
 from ..priors.ground import Plane, ground
-from ..priors.initialization import A_WRONG_MASK, Points, around_hull
+from ..priors.initialization import Points, around_hull
 from ..settings.settings import Settings
 from ..shading import deferred
 from ..surfels.surfels import SH_0, SurfelColumns
@@ -33,6 +33,7 @@ _STEPS = 200  # of the short fit
 _CLEAR_OF_GROUND = 0.03  # half edges of the box
 _HOLE = 0.02  # of a silhouette: what is smaller is none
 _SOLID, _ALIKE = 0.9, 0.6  # coverage; of what hull or silhouettes cover by so much both do, in the mean: less is no object
+_WRONG = 12  # in so many silhouettes one may be wrong at any point: a hull of fewer is bitten into, one of more too large
 _POSITIONS, _NORMALS = 2, 5  # steps that a hull of such silhouettes is smoothed over, and its normals again
 _LEAST = 0.25  # of the points, at least, that start on the hull
 _MARGIN = 0.05  # of the box beside the hull, over its longest edge
@@ -62,6 +63,7 @@ def found(
         release_memory()
         progress.update(0.9)
         field = _hull(views)
+        field = field and hull.sunk(field, points.positions)
         progress.update(1)
     if not quiet:
         stands = "" if below is None else ", above the ground"
@@ -70,9 +72,7 @@ def found(
         print(f"{start if field else nowhere} (--set initialization.foreground=… changes it)", file=sys.stderr)
     if field is None:
         return None
-    part = float(np.mean([view.alpha.mean() for view in views]))
-    count = int(len(points.positions) * max(part, _LEAST))
-    return around_hull(points, dataset.train, field, _NORMALS, count, rng), _box_of(field)
+    return around_hull(points, dataset.train, field, _NORMALS, _LEAST, rng), _box_of(field)
 
 
 def _trial(settings):
@@ -122,7 +122,7 @@ def _marked(fit, box, below) -> SurfelColumns:
 def _hull(views) -> hull.SignedField | None:
     """The largest piece of the visual hull of ``views``; None where these have none, or another object each."""
     try:
-        field = hull.visual_hull(views, outvoted=len(views) // A_WRONG_MASK)
+        field = hull.visual_hull(views, outvoted=len(views) // _WRONG)
         field = hull.largest_piece(replace(field, values=ndimage.gaussian_filter(field.values, _POSITIONS)))
     except UserError:
         return None

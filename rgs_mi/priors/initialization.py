@@ -109,14 +109,14 @@ def _on_hull(views, count, rng, compare, outvoted, quiet) -> Points:
 
 
 def around_hull(
-    points: Points, views: Sequence[View], field: hull.SignedField, over: float, count: int, rng: np.random.Generator
+    points: Points, views: Sequence[View], field: hull.SignedField, over: float, least: float, rng: np.random.Generator
 ) -> Points:
-    """Return those of ``points`` that lie beside the hull that ``field`` is of, and ``count`` more on it, with normals that are
-    smoothed ``over`` so many steps, which ``views`` show without masks."""
+    """Return those of ``points`` that lie beside the hull that ``field`` is of, and on it as many as the others were, but for a
+    ``least`` part of all, with normals that are smoothed ``over`` so many steps; ``views`` show them without masks."""
     node = (points.positions - field.lower) / field.step
     inside = ndimage.map_coordinates(field.values, node.T, order=1, mode="constant", cval=-np.inf) > -_BESIDE * field.step
     mesh = hull.surface(field, over)
-    positions, normals = sample_surface(*mesh, count, rng)
+    positions, normals = sample_surface(*mesh, max(int(inside.sum()), int(least * len(inside))), rng)
     return points.chosen(~inside).joined_with(_seen_on(mesh, positions, normals, views))
 
 
