@@ -32,8 +32,9 @@ from .trainer import Fit
 _STEPS = 200  # of the short fit
 _CLEAR_OF_GROUND = 0.03  # half edges of the box
 _HOLE = 0.02  # of a silhouette: what is smaller is none
+_DEEP, _MIRRORED = 8, 0.2  # steps below the hull; so large a part of the points within it that lie there are of a mirror
 _SOLID, _ALIKE = 0.9, 0.6  # coverage; of what hull or silhouettes cover by so much both do, in the mean: less is no object
-_WRONG = 12  # in so many silhouettes one may be wrong at any point: a hull of fewer is bitten into, one of more too large
+_WRONG = 20  # in so many silhouettes one may be wrong at any point: a hull of fewer is bitten into, one of more too large
 _POSITIONS, _NORMALS = 2, 5  # steps that a hull of such silhouettes is smoothed over, and its normals again
 _LEAST = 0.25  # of the points, at least, that start on the hull
 _MARGIN = 0.05  # of the box beside the hull, over its longest edge
@@ -49,7 +50,7 @@ def found(
 ) -> tuple[Points, BoundingBox] | None:
     """Return where surfels start if those of the object start on a visual hull, and the box around that: of ``points``, which
     photographs without masks agree on, those that lie beside it stay. ``fit_of`` starts a fit from points. None where nothing
-    in the ``box`` has silhouettes that belong together. It tells of it."""
+    in the ``box`` has silhouettes that belong together, and where what has them does not mirror. It tells of it."""
     assert points.normals is not None, "points on surfaces"
     rng = np.random.default_rng((settings.seed, 3))
     below = ground(points.positions, points.normals, box, [view.camera for view in dataset.train], rng)
@@ -63,14 +64,15 @@ def found(
         release_memory()
         progress.update(0.9)
         field = _hull(views)
-        field = field and hull.sunk(field, points.positions)
         progress.update(1)
+    mirrors = field and _mirrors(field, points.positions)
     if not quiet:
-        stands = "" if below is None else ", above the ground"
-        start = f"photographs show an object{stands}: surfels start on its hull"
-        nowhere = "no object stands out in all photographs: surfels start where photographs agree"
-        print(f"{start if field else nowhere} (--set initialization.foreground=… changes it)", file=sys.stderr)
-    if field is None:
+        what = "no one object" if field is None else "an object that mirrors" if mirrors else "an object"
+        where = "on its hull" if mirrors else "where they agree on a depth"
+        print(
+            f"photographs show {what}: surfels start {where} (--set initialization.foreground=… changes it)", file=sys.stderr
+        )
+    if field is None or not mirrors:
         return None
     return around_hull(points, dataset.train, field, _NORMALS, _LEAST, rng), _box_of(field)
 
@@ -133,6 +135,13 @@ def _hull(views) -> hull.SignedField | None:
     pairs = [(np.isfinite(depth), view.alpha > _SOLID) for depth, view in zip(depths, views)]
     alike = np.mean([(one & other).sum() / max((one | other).sum(), 1) for one, other in pairs])
     return field if alike >= _ALIKE else None
+
+
+def _mirrors(field, positions) -> bool:
+    """Whether much of what photographs agree on within a hull lies deep below it, as what a mirror shows does."""
+    depth = field.depth(positions) / field.step
+    within = depth > 0
+    return bool(within.any()) and float((depth[within] > _DEEP).mean()) > _MIRRORED
 
 
 def _box_of(field: hull.SignedField) -> BoundingBox:

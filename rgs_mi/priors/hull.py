@@ -21,8 +21,6 @@ _EDGE_SIGMA = 0.6  # pixels; small enough that lines one pixel wide stay above o
 _PIXEL_VARIANCE = 1 / 12  # of the box that an antialiased mask has been averaged over
 _FULL = 0.9  # a mask with more than this in a border pixel goes on beyond the frame
 _PAD = 2  # pixels of nothing around a mask that ends in its frame, as wide as the blur reaches
-_AWAY, _NEAR = 12, (-2, 5)  # steps: how far the distances of `sunk` go, and depths of points that are near a surface
-_AROUND, _ALONE = 4, 0.02  # steps over which their depths are averaged, and weight of the median, over that of the points
 _STEPS = 160, 400  # along the longest side, at least and at most, where a step would be a pixel
 
 
@@ -39,6 +37,18 @@ class SignedField:
     values: np.ndarray
     lower: np.ndarray
     step: float
+
+    def at(self, positions: np.ndarray) -> np.ndarray:
+        """Return the field [N] at ``positions`` [N, 3], in world units; −∞ beyond the grid."""
+        return self._sampled(self.values, positions, -np.inf)
+
+    def depth(self, positions: np.ndarray) -> np.ndarray:
+        """Return how deep below the surface ``positions`` [N, 3] are, to a step: [N] world units, not truncated; 0 outside."""
+        return self.step * self._sampled(ndimage.distance_transform_edt(self.values > 0), positions, 0.0)
+
+    def _sampled(self, values, positions, beyond):
+        node = ((positions - self.lower) / self.step).T
+        return ndimage.map_coordinates(values, node, order=1, mode="constant", cval=beyond)
 
 
 # ---- Silhouettes ----
@@ -258,26 +268,6 @@ def largest_piece(field: SignedField) -> SignedField:
         return field
     largest = 1 + np.argmax(np.bincount(pieces.ravel())[1:])
     return replace(field, values=np.where((pieces > 0) & (pieces != largest), -field.step, field.values))
-
-
-def sunk(field: SignedField, positions: np.ndarray) -> SignedField:
-    """Return ``field`` with its surface moved to where those of ``positions`` [N, 3] are that lie near it: hulls are too large,
-    the more so the more views are outvoted. Where there are none it moves as far as it does in the median; not at all without
-    any. Its values are signed distances up to `_AWAY` steps."""
-    inside, distance = field.values > 0, ndimage.distance_transform_edt
-    signed = np.where(inside, np.asarray(distance(inside)) - 0.5, 0.5 - np.asarray(distance(~inside)))
-    values = ndimage.gaussian_filter(np.pad(np.clip(signed, -_AWAY, _AWAY), _AWAY, constant_values=-_AWAY), 1)
-    node = (positions - field.lower) / field.step + _AWAY
-    depth = ndimage.map_coordinates(values, node.T, order=1, mode="constant", cval=-_AWAY)
-    near = (depth > _NEAR[0]) & (depth < _NEAR[1])
-    if near.any():
-        index, (total, weight) = tuple(np.rint(node[near]).astype(int).T), np.zeros((2, *values.shape))
-        np.add.at(total, index, depth[near])
-        np.add.at(weight, index, 1)
-        total, weight = (ndimage.gaussian_filter(sums, _AROUND) for sums in (total, weight))
-        alone = _ALONE * weight[index].mean()
-        values = values - (total + alone * np.median(depth[near])) / (weight + alone)
-    return SignedField((field.step * values).astype(np.float32), field.lower - _AWAY * field.step, field.step)
 
 
 # ---- The surface ----

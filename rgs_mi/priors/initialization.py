@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage, spatial
+from scipy import spatial
 
 from ..core.camera import focus_point
 from ..datasets.types import Dataset, View
@@ -113,8 +113,7 @@ def around_hull(
 ) -> Points:
     """Return those of ``points`` that lie beside the hull that ``field`` is of, and on it as many as the others were, but for a
     ``least`` part of all, with normals that are smoothed ``over`` so many steps; ``views`` show them without masks."""
-    node = (points.positions - field.lower) / field.step
-    inside = ndimage.map_coordinates(field.values, node.T, order=1, mode="constant", cval=-np.inf) > -_BESIDE * field.step
+    inside = field.at(points.positions) > -_BESIDE * field.step
     mesh = hull.surface(field, over)
     positions, normals = sample_surface(*mesh, max(int(inside.sum()), int(least * len(inside))), rng)
     return points.chosen(~inside).joined_with(_seen_on(mesh, positions, normals, views))

@@ -63,9 +63,9 @@ class Initialization:
         "the hull.",
     )
     foreground: bool = Field(
-        default=False,
-        description="Where photographs have no masks, a short fit tells what they show of an object, above the ground; surfels "
-        "start on the visual hull of that. For mirrors, which have no depth that photographs agree on.",
+        default=True,
+        description="Where photographs have no masks, a short fit tells what they show of an object, above the ground; if that "
+        "mirrors, so that they agree on depths deep within it, surfels start on its visual hull.",
     )
     silhouettes: bool = Field(
         default=True,
