@@ -201,7 +201,7 @@ def start(scene: FitScene, dataset: Dataset, settings: Settings, quiet: bool = T
             begin.roughness,
             points.appearance.metallic,
             settings.shader,
-            two_sided=None if box is None else True,
+            two_sided=True if begin.two_sided or box is not None else None,
             center=center,
             room=None if settings.room is None else np.multiply(settings.room, extent),
             specular=specular if learns_specular else None,

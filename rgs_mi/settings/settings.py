@@ -82,6 +82,11 @@ class Initialization:
         description="Opacity of all surfels. Unless given, it is 0.1 at random points, else 0.7.",
     )
     roughness: float = Field(default=0.3, ge=0, le=1, description="Roughness of all surfels.")
+    two_sided: bool = Field(
+        default=False,
+        description="Surfels show from behind, too, so that those that turn away while they are fitted are not lost. Those of an "
+        "object among surroundings, and those that face anywhere at first, always do.",
+    )
     surroundings: int = Field(
         default=5_000, ge=0, le=1_000_000, description="So many more surfels lie far away where photographs have no masks."
     )

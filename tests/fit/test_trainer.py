@@ -546,6 +546,13 @@ def test_opacities_to_start_with(dataset, where, opacity):
     np.testing.assert_allclose(start(scene, data, settings).model.surfels(0).opacities.numpy(), 0.4, rtol=1e-5)
 
 
+@pytest.mark.parametrize("chosen, hull, two_sided", [(False, True, False), (True, True, True), (False, False, True)])
+def test_which_surfels_show_from_behind(dataset, chosen, hull, two_sided):
+    scene = SimpleNamespace(shading=Shading(), environment=model().environment())
+    begin = Initialization(surfels=50, hull=hull, two_sided=chosen)
+    assert start(scene, dataset, replace(SETTINGS, initialization=begin)).model.two_sided == two_sided
+
+
 def test_gives_memory_back_that_steps_have_freed(dataset, monkeypatch):
     """Once a GiB and a half more is held than when that was done last; a system that does not say what is held is left alone."""
     held, released = iter([1.0, 1.5, 2.4, 2.9, 3.1, 1.2, 2.6]), []
