@@ -8,6 +8,7 @@ from .surfels import SurfelColumns
 
 _SOLID = 0.2  # a ray meets a surfel where it is at least this opaque
 _CLEARANCE = 2.0  # rays start that many standard deviations of a typical surfel above the surface
+_THICKNESS = 5.0  # of a surface made of surfels, in clearances
 _CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 _TRIANGLES = (0, 1, 2, 0, 2, 3)
 
@@ -40,20 +41,23 @@ class Proxies:
       extent     half the width of each quad, in standard deviations
       normal     geometric normals, world space
       clearance  how far above the surface rays start, world units, of width 1
+      thickness  how far from there a surface may show them its back, world units, of width 1
     """
 
     def __init__(self, surfels: SurfelColumns, solid: float = _SOLID, box: BoundingBox | None = None) -> None:
         with dr.suspend_grad():
-            opacity = surfels.column(mi.Float, "opacities")
+            opacity, counts = surfels.column(mi.Float, "opacities"), dr.opaque(mi.Float, 1, len(surfels))
             if box is not None:
-                opacity = dr.select(box.contains(surfels.column(mi.Point3f, "centers")), opacity, 0)
+                inside = box.contains(surfels.column(mi.Point3f, "centers"))
+                opacity, counts = dr.select(inside, opacity, 0), dr.select(inside, counts, 0)
             self.extent = dr.sqrt(2 * dr.log(dr.maximum(opacity / solid, 1)))
             positions, faces = quads(corners(surfels, self.extent))
             self.normal = surfels.frames()[2]
             scale = surfels.column(mi.Vector2f, "scales")
-            count = dr.opaque(mi.Float, len(surfels))  # dr.mean would compile it into a kernel
-            self.clearance = _CLEARANCE * dr.sum(dr.minimum(scale.x, scale.y)) / count
-            dr.eval(positions, faces, self.extent, self.normal, self.clearance)
+            typical = dr.sum(counts * dr.minimum(scale.x, scale.y)) / dr.maximum(dr.sum(counts), 1)
+            self.clearance = _CLEARANCE * typical
+            self.thickness = _THICKNESS * self.clearance
+            dr.eval(positions, faces, self.extent, self.normal, self.clearance, self.thickness)
             mesh = mi.Mesh("proxies", 4 * len(surfels), 2 * len(surfels))
             params = mi.traverse(mesh)
             params["vertex_positions"], params["faces"] = positions, faces
@@ -64,14 +68,15 @@ class Proxies:
     def intersect(
         self, origin: "mi.Point3f", normal: "mi.Vector3f", direction: "mi.Vector3f", active: "mi.Bool | bool" = True
     ) -> "tuple[mi.Bool, mi.UInt32, mi.Point2f]":
-        """Return (found, index, uv): whether ``active`` rays meet the front of a surfel, which, and where on it (see
-        `Surfels.normals`). All vectors are in world space; ``normal`` is that of the surface that the rays leave."""
+        """Return (found, index, uv): whether ``active`` rays meet a surfel, which, and where on it (see `Surfels.normals`): the
+        front of one, or the back where it is two-sided and not part of the surface that the rays leave, by its thickness. All
+        vectors are in world space; ``normal`` is that of this surface."""
         with dr.suspend_grad():
             ray = mi.Ray3f(mi.Point3f(origin + self.clearance * normal), mi.Vector3f(direction))
             hit = self.scene.ray_intersect_preliminary(ray, coherent=False, active=active)
             found, index = hit.is_valid(), hit.prim_index // 2
-            if not self.two_sided:
-                found &= dr.dot(dr.gather(mi.Vector3f, self.normal, index, found), ray.d) < 0
+            away = dr.dot(dr.gather(mi.Vector3f, self.normal, index, found), ray.d) > 0
+            found &= ~(away & (hit.t < self.thickness)) if self.two_sided else ~away
             uv = dr.gather(mi.Float, self.extent, index, found) * mi.Point2f(*self.position(hit))
             dr.eval(found, index, uv)
             return found, index, uv

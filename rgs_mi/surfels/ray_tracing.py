@@ -23,7 +23,6 @@ from .surfels import Surfels, sh_order
 
 _CUTOFFS = Cutoffs(alpha_min=0.01, transmittance_min=0.01)  # against 1/255 and 1e-3: three times as fast, normals 0.2° off
 _STEP = 2e-6  # past a crossing, relative to coordinates: a dozen float32 roundings
-_THICKNESS = 5.0  # of a surface made of surfels, in clearances
 _NONE = 0xFFFFFFFF
 _SHAPE, _MATERIAL = 12, 8  # floats in a row
 
@@ -73,8 +72,7 @@ class SurfelRayTracer:
                 ]
             )
             self.sh, self.channels = dr.detach(surfels.sh.array), surfels.sh.shape[1]
-            self.thickness = _THICKNESS * self.proxies.clearance
-            dr.eval(self.shape, self.material, self.sh, self.thickness)
+            dr.eval(self.shape, self.material, self.sh)
         self.two_sided = surfels.two_sided
 
     @dr.syntax
@@ -158,7 +156,7 @@ class SurfelRayTracer:
         alpha = opacity * dr.exp(-0.5 * (u * u + v * v))
         away = dr.dot(normal, ray.d) > 0
         shows = valid & (alpha > _CUTOFFS.alpha_min) & (index != last)
-        shows &= ~(away & (leaves & (distance < self.thickness))) if self.two_sided else ~away
+        shows &= ~(away & (leaves & (distance < self.proxies.thickness))) if self.two_sided else ~away
         alpha = dr.select(shows, dr.minimum(alpha, _CUTOFFS.alpha_max), 0)
         normal += u * dn_du + v * dn_dv
         return valid, distance, index, alpha, dr.select(away, -normal, normal)

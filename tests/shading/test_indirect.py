@@ -30,8 +30,8 @@ WALL = np.array([0.9, 0.3, 0.1])  # radiance
 
 
 def brute_force(surfels, origin, direction, solid=0.2):
-    """[R] number of the nearest quad that each ray meets (-1: none), whether it meets its front, and where [R, 2], in
-    standard deviations from its middle."""
+    """[R] number of the nearest quad that each ray meets (-1: none), whether it meets its front, where [R, 2], in standard
+    deviations from its middle, and the distance to it."""
     s = {name: value.astype(np.float64) for name, value in surfels.numpy().items()}
     t_u, t_v, normal = (np.array(v).T for v in surfels.frames())
     extent = np.sqrt(2 * np.log(np.maximum(s["opacities"] / solid, 1)))
@@ -44,7 +44,7 @@ def brute_force(surfels, origin, direction, solid=0.2):
         uv = np.stack([offset @ t_u[i], offset @ t_v[i]], 1) / s["scales"][i]
         hit = (abs(uv) < extent[i]).all(1) & (t > 0) & (t < nearest)
         nearest[hit], number[hit], front[hit], uv_hit[hit] = t[hit], i, cosine[hit] < 0, uv[hit]
-    return number, front, uv_hit
+    return number, front, uv_hit, nearest
 
 
 @pytest.mark.parametrize("two_sided", [True, False])
@@ -55,10 +55,12 @@ def test_rays_meet_what_brute_force_says(two_sided):
     direction = 0.5 * rng.normal(size=(4000, 3)) - origin  # inwards, mostly
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     normal = np.zeros((4000, 3))
-    found, number, uv = Proxies(surfels).intersect(mi.Point3f(origin.T), mi.Vector3f(normal.T), mi.Vector3f(direction.T))
-    expected, front, where = brute_force(surfels, origin, direction)
-    hit = (expected >= 0) & (front | two_sided)
+    proxies = Proxies(surfels)
+    found, number, uv = proxies.intersect(mi.Point3f(origin.T), mi.Vector3f(normal.T), mi.Vector3f(direction.T))
+    expected, front, where, distance = brute_force(surfels, origin, direction)
+    hit = (expected >= 0) & (front | (two_sided & (distance > proxies.thickness.numpy())))
     assert 0.1 < hit.mean() < 0.9
+    assert not two_sided or min(((expected >= 0) & ~front & ~hit).sum(), (hit & ~front).sum()) > 10
     differs = (found.numpy() != hit) | hit & (number.numpy() != expected)
     assert differs.mean() < 1e-3  # rays along an edge, in single precision
     assert np.allclose(uv.numpy().T[hit & ~differs], where[hit & ~differs], atol=1e-3)
