@@ -27,7 +27,7 @@ def brute_force(surfels, origin, direction, maxt, leaves):
     """(8) of `rays.py` for each ray: (A, t, unit normal, roughness, weights [rays, N] in the order of the surfels)."""
     s = {name: value.astype(np.float64) for name, value in surfels.numpy().items()}
     t_u, t_v, normal = (np.array(v, np.float64).T for v in surfels.frames())
-    cut, thickness = ray_tracing._CUTOFFS, ray_tracing._THICKNESS * 2 * s["scales"].min(1).mean()
+    cut, thickness = ray_tracing._CUTOFFS, proxies._THICKNESS * 2 * s["scales"].min(1).mean()
     coverage, t_mean, mean, rough = (np.zeros((len(origin), k)) for k in (1, 1, 3, 1))
     weights = np.zeros((len(origin), len(surfels)))
     for r, (o, d) in enumerate(zip(origin, direction)):
