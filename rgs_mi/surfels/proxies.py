@@ -46,16 +46,15 @@ class Proxies:
 
     def __init__(self, surfels: SurfelColumns, solid: float = _SOLID, box: BoundingBox | None = None) -> None:
         with dr.suspend_grad():
-            opacity, counts = surfels.column(mi.Float, "opacities"), dr.opaque(mi.Float, 1, len(surfels))
+            opacity = surfels.column(mi.Float, "opacities")
             if box is not None:
-                inside = box.contains(surfels.column(mi.Point3f, "centers"))
-                opacity, counts = dr.select(inside, opacity, 0), dr.select(inside, counts, 0)
+                opacity = dr.select(box.contains(surfels.column(mi.Point3f, "centers")), opacity, 0)
             self.extent = dr.sqrt(2 * dr.log(dr.maximum(opacity / solid, 1)))
             positions, faces = quads(corners(surfels, self.extent))
             self.normal = surfels.frames()[2]
             scale = surfels.column(mi.Vector2f, "scales")
-            typical = dr.sum(counts * dr.minimum(scale.x, scale.y)) / dr.maximum(dr.sum(counts), 1)
-            self.clearance = _CLEARANCE * typical
+            count = dr.opaque(mi.Float, len(surfels))  # dr.mean would compile it into a kernel
+            self.clearance = _CLEARANCE * dr.sum(dr.minimum(scale.x, scale.y)) / count
             self.thickness = _THICKNESS * self.clearance
             dr.eval(positions, faces, self.extent, self.normal, self.clearance, self.thickness)
             mesh = mi.Mesh("proxies", 4 * len(surfels), 2 * len(surfels))
