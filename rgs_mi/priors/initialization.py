@@ -17,7 +17,7 @@ from .surface_points import oriented_points
 
 _FAR = 10
 _DEEPER = 2  # area of what lies below the hull, over that of the hull that is seen through
-A_WRONG_MASK = 32  # in so many photographs one mask may be wrong at any point
+_A_WRONG_MASK = 32  # in so many photographs one mask may be wrong at any point
 _COMPARED = 120  # photographs at most that are compared: more say little more, and half a second goes into each
 _BESIDE = 1.5  # steps of the hull's grid that a point lies off it at least, which counts as beside it
 _FEW = 0.1  # of the points that are wanted: fewer that photographs agree on are no start
@@ -67,7 +67,7 @@ def initial_points(
     rng, views = np.random.default_rng(seed), dataset.train
     if any(view.masked for view in views):
         if on_hull:
-            return _on_hull(views, count, rng, compare, len(views) // A_WRONG_MASK if dataset.photographed else 0, quiet)
+            return _on_hull(views, count, rng, compare, len(views) // _A_WRONG_MASK if dataset.photographed else 0, quiet)
     elif compare:
         compared = _spread(views)
         maps = stereo.verified(stereo.depth_maps(compared, quiet=quiet))
@@ -111,8 +111,9 @@ def _on_hull(views, count, rng, compare, outvoted, quiet) -> Points:
 def around_hull(
     points: Points, views: Sequence[View], field: hull.SignedField, over: float, least: float, rng: np.random.Generator
 ) -> Points:
-    """Return those of ``points`` that lie beside the hull that ``field`` is of, and on it as many as the others were, but for a
-    ``least`` part of all, with normals that are smoothed ``over`` so many steps; ``views`` show them without masks."""
+    """Return those of ``points`` that lie beside the hull that ``field`` is of, and on it as many as the others were, or a
+    ``least`` part of all if that is more, with normals that are smoothed ``over`` so many steps; ``views`` show them without
+    masks."""
     inside = field.at(points.positions) > -_BESIDE * field.step
     mesh = hull.surface(field, over)
     positions, normals = sample_surface(*mesh, max(int(inside.sum()), int(least * len(inside))), rng)

@@ -224,7 +224,7 @@ class Density:
         le=10_000_000,
         description="Never more surfels than this; unless given, 50,000, or 5,000 a minute, up to 150,000; of photographs, which "
         "have relief, as many as one shows pixels of the object, if that is more, but 15,000 a minute at most; without masks "
-        "25,000, up to 250,000.",
+        "40,000, up to 400,000.",
     )
     guided: bool = Field(
         default=False,
